@@ -1,0 +1,11 @@
+r"""DrQ-v2 from pixels on the true reward: the backbone, and the paper's experts.
+
+    python -m jaxil.launch --config=configs/drqv2.py:cheetah_run --workdir=runs/drqv2
+"""
+
+from jaxil import config as jaxil_config
+
+
+def get_config(task: str = "walker_walk"):
+    """Returns the paper's settings for `task`."""
+    return jaxil_config.default_config("drqv2", task)

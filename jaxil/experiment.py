@@ -1,0 +1,297 @@
+"""From a checked config to the parts of a run: environments, learner, rewarder."""
+
+from typing import Any, NamedTuple
+
+import jax
+import ml_collections
+import numpy as np
+import optax
+
+from jaxil import config as jaxil_config
+from jaxil.host import demonstrations as host_demonstrations
+from jaxil.host.environment import (
+    PixelEnvironment,
+    known_tasks,
+    make_environment,
+)
+from jaxil.host.replay import Replay
+from jaxil.learner.policy import Exploit, Explore, make_exploit, make_explore
+from jaxil.learner.state import TrainState
+from jaxil.learner.update import (
+    Learner,
+    UpdateStep,
+    init_train_state,
+    make_update_step,
+)
+from jaxil.maths.types import ExpertEpisodes
+from jaxil.networks.agent import AgentNetworks, make_agent_networks
+from jaxil.rewarders.adversarial import make_adversarial_rewarder
+from jaxil.rewarders.rewarder import Rewarder, Spec
+from jaxil.rewarders.sinkhorn import make_sinkhorn_rewarder
+from jaxil.rewarders.task import make_task_rewarder, make_zero_rewarder
+
+# Added to the seed for what must not share its random starts with training.
+_EVALUATION_SEED = 1_000_003
+
+
+class Agent(NamedTuple):
+    """The compiled functions of a run, and what they start from.
+
+    Attributes:
+      update_step: (state, batch, expert batch) -> (state, metrics); donates state.
+      explore: see `policy.make_explore`.
+      exploit: see `policy.make_exploit`.
+      rewards: the rewarder's, at episode end.
+      rewarder: the method itself.
+      init_state: () -> the state before the first update.
+    """
+
+    update_step: UpdateStep
+    explore: Explore
+    exploit: Exploit
+    rewards: Any
+    rewarder: Rewarder
+    init_state: Any
+
+
+def problems(config: ml_collections.ConfigDict) -> list[str]:
+    """Returns one sentence for each reason why a config can't be run here.
+
+    Reads the demonstration file, but renders nothing.
+    """
+    faults = jaxil_config.problems(config, known_tasks())
+    wants = jaxil_config.uses_demonstrations(config)
+    if wants and config.task in known_tasks() and config.demonstrations.num_episodes > 0:
+        try:
+            host_demonstrations.check(
+                config.demonstrations.source,
+                task=config.task,
+                num_episodes=config.demonstrations.num_episodes,
+                action_repeat=config.action_repeat,
+            )
+        except host_demonstrations.DemonstrationError as error:
+            faults.append(f"demonstrations.source={config.demonstrations.source!r}: {error}")
+    return faults
+
+
+def renderer_name(config: ml_collections.ConfigDict) -> str:
+    """Returns what GL calls the device that will draw this run's pixels.
+
+    Raises:
+      RuntimeError: nothing here can render.
+    """
+    environment = training_environment(config)
+    name = environment.renderer.gl_name()
+    environment.close()
+    return name
+
+
+def training_environment(config: ml_collections.ConfigDict) -> PixelEnvironment:
+    """Returns the environment that gathers experience."""
+    return _environment(config, config.seed)
+
+
+def evaluation_environment(config: ml_collections.ConfigDict) -> PixelEnvironment:
+    """Returns an environment of its own, with starts of its own."""
+    return _environment(config, config.seed + _EVALUATION_SEED)
+
+
+def _environment(config: ml_collections.ConfigDict, seed: int) -> PixelEnvironment:
+    return make_environment(
+        config.task,
+        seed=seed,
+        action_repeat=config.action_repeat,
+        image_size=config.image_size,
+        frame_stack=config.frame_stack,
+        render_quality=config.render_quality,
+        observation=config.observation,
+    )
+
+
+def load_demonstrations(
+    config: ml_collections.ConfigDict, progress: Any = None
+) -> host_demonstrations.Demonstrations | None:
+    """Returns the demonstrations of a run, rendered as the agent sees; or None.
+
+    Raises:
+      DemonstrationError: the file can't serve this run.
+    """
+    if not jaxil_config.uses_demonstrations(config):
+        return None
+    return host_demonstrations.load(
+        config.demonstrations.source,
+        task=config.task,
+        num_episodes=config.demonstrations.num_episodes,
+        action_repeat=config.action_repeat,
+        image_size=config.image_size,
+        render_quality=config.render_quality,
+        observation=config.observation,
+        progress=progress,
+    )
+
+
+def make_replay(
+    config: ml_collections.ConfigDict, environment: PixelEnvironment
+) -> Replay:
+    """Returns an empty replay of the config's size."""
+    frame = environment.reset(episode=0) and environment.single_observation()
+    return Replay(
+        capacity_steps=config.replay_size_steps,
+        episode_steps=environment.episode_steps or config.replay_size_steps,
+        observation_shape=frame.shape,
+        observation_dtype=frame.dtype,
+        action_dim=environment.action_spec().shape[0],
+        frame_stack=stack_size(config),
+        num_steps=config.num_steps,
+        discount_factor=config.discount_factor,
+    )
+
+
+def stack_size(config: ml_collections.ConfigDict) -> int:
+    """Returns the frames in an observation: state vectors are not stacked."""
+    return config.frame_stack if config.observation == "pixels" else 1
+
+
+def exploration_schedule(config: ml_collections.ConfigDict) -> optax.Schedule:
+    """Returns the noise's standard deviation by agent step."""
+    return optax.linear_schedule(
+        config.exploration_std_start,
+        config.exploration_std_end,
+        config.exploration_std_steps,
+    )
+
+
+def make_networks(
+    config: ml_collections.ConfigDict, action_dim: int, mean: Any
+) -> AgentNetworks:
+    """Returns the agent's networks.
+
+    Args:
+      config: checked.
+      action_dim: A.
+      mean: what the encoder subtracts, in [0, 1]: a number or [H, W, C].
+    """
+    return make_agent_networks(
+        action_dim=action_dim,
+        feature_dim=config.feature_dim,
+        hidden_dim=config.hidden_dim,
+        observation=config.observation,
+        channels=tuple(config.encoder.channels),
+        kernel_sizes=tuple(config.encoder.kernel_sizes),
+        strides=tuple(config.encoder.strides),
+        contrast=config.encoder.contrast,
+        mean=mean,
+    )
+
+
+def mean_image(
+    config: ml_collections.ConfigDict,
+    demonstrations: host_demonstrations.Demonstrations | None,
+) -> Any:
+    """Returns what the encoder subtracts: 0.5, or the demonstrations' mean image."""
+    if not config.encoder.subtract_mean_image or demonstrations is None:
+        return 0.5
+    total = np.zeros(demonstrations.frames.shape[2:], np.float64)
+    for episode in demonstrations.frames:  # one at a time: bounded memory
+        total += episode.sum(axis=0, dtype=np.float64)
+    count = demonstrations.frames.shape[0] * demonstrations.frames.shape[1]
+    mean = (total / count / 255.0).astype(np.float32)
+    return np.concatenate([mean] * config.frame_stack, axis=-1)
+
+
+def make_rewarder(
+    config: ml_collections.ConfigDict, networks: AgentNetworks
+) -> Rewarder:
+    """Returns the imitation method that the config names."""
+    if config.method == "pdac":
+        return make_adversarial_rewarder(
+            networks,
+            hidden_dim=config.discriminator.hidden_dim,
+            learning_rate=config.discriminator.learning_rate,
+            penalty_weight=config.discriminator.gradient_penalty,
+            batch_size=config.discriminator.batch_size,
+            sees_actions=config.discriminator.sees_actions,
+            shift_padding=config.shift_padding,
+            frame_stack=stack_size(config),
+        )
+    if config.method == "psil":
+        return make_sinkhorn_rewarder(
+            networks,
+            epsilon=config.sinkhorn.epsilon,
+            num_iterations=config.sinkhorn.num_iterations,
+            target_update_steps=config.sinkhorn.target_update_steps,
+            return_scale=config.sinkhorn.return_scale,
+            frame_stack=stack_size(config),
+        )
+    if config.method == "zero":
+        return make_zero_rewarder()
+    return make_task_rewarder()
+
+
+def make_agent(
+    config: ml_collections.ConfigDict,
+    environment: PixelEnvironment,
+    demonstrations: host_demonstrations.Demonstrations | None,
+) -> Agent:
+    """Returns the compiled functions of a run.
+
+    Args:
+      config: checked.
+      environment: read for its specs only.
+      demonstrations: what the method imitates, or None.
+    """
+    action_dim = environment.action_spec().shape[0]
+    networks = make_networks(config, action_dim, mean_image(config, demonstrations))
+    rewarder = make_rewarder(config, networks)
+    schedule = exploration_schedule(config)
+    first_update = config.seed_frames // config.action_repeat
+    learner = Learner(
+        networks=networks,
+        rewarder=rewarder,
+        learning_rate=config.learning_rate,
+        critic_target_tau=config.critic_target_tau,
+        noise_clip=config.noise_clip,
+        shift_padding=config.shift_padding,
+        pre_tanh_penalty=config.pre_tanh_penalty,
+        exploration_std=lambda num_updates: schedule(
+            first_update + num_updates * config.update_every_steps
+        ),
+    )
+    frames = None if demonstrations is None else demonstrations.frames
+    spec = Spec(
+        action_dim=action_dim,
+        feature_dim=config.feature_dim,
+        num_demonstrations=0 if frames is None else frames.shape[0],
+        expert_steps=0 if frames is None else frames.shape[1] - 1,
+    )
+    observation = np.zeros(
+        environment.observation_spec().shape, environment.observation_spec().dtype
+    )
+    return Agent(
+        # The old state is dead after the call, so XLA may reuse its memory.
+        update_step=jax.jit(make_update_step(learner), donate_argnums=0),
+        explore=jax.jit(make_explore(networks, schedule)),
+        exploit=jax.jit(make_exploit(networks)),
+        rewards=jax.jit(rewarder.rewards),
+        rewarder=rewarder,
+        init_state=lambda: init_train_state(
+            learner, jax.random.key(config.seed), observation, spec
+        ),
+    )
+
+
+def expert_episodes(
+    rewarder: Rewarder, demonstrations: host_demonstrations.Demonstrations | None
+) -> ExpertEpisodes | None:
+    """Puts the demonstrations on the device, where the method matches episodes."""
+    if not rewarder.matches_episodes or demonstrations is None:
+        return None
+    return ExpertEpisodes(
+        jax.numpy.asarray(demonstrations.frames),
+        jax.numpy.asarray(demonstrations.actions),
+    )
+
+
+def abstract_state(agent: Agent) -> TrainState:
+    """Returns shapes and dtypes of the learner's state, for a checkpoint to fill."""
+    return jax.eval_shape(agent.init_state)

@@ -1,0 +1,1 @@
+"""Simulators, files and clocks: everything that touches the machine, in NumPy."""

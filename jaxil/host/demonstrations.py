@@ -1,0 +1,421 @@
+"""Demonstrations: a small file of simulator states, drawn where they are used.
+
+Such a file is a NumPy archive (.npz) of K episodes of T agent steps:
+
+    qpos, qvel, act   float64 [K, T + 1, nq], [K, T + 1, nv], [K, T + 1, na]
+    actions, rewards  float32 [K, T, A], [K, T]
+    metadata          a JSON text, see `new_metadata`
+
+Pixels are not stored: they would be a thousand times larger, and would not match the
+renderer of another machine. Baselines alone may look at actions and rewards.
+"""
+
+import importlib.metadata
+import json
+import logging
+import math
+import os
+import pathlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxil.host import archive, rendering
+from jaxil.host import environment as environments
+
+FORMAT = "jaxil-demonstrations"
+VERSION = 1
+_MAX_METADATA_BYTES = 1024**2
+_ARRAYS = {  # name: dtype, number of axes, states per episode beyond its steps
+    "qpos": (np.dtype(np.float64), 3, 1),
+    "qvel": (np.dtype(np.float64), 3, 1),
+    "act": (np.dtype(np.float64), 3, 1),
+    "actions": (np.dtype(np.float32), 3, 0),
+    "rewards": (np.dtype(np.float32), 2, 0),
+}
+_METADATA = {
+    "task": str,
+    "action_repeat": int,
+    "camera": int,
+    "versions": dict,
+    "seed": int,
+    "first_episode": int,
+    "expert": str,
+    "returns": list,
+}
+_REMAKE = "Record it again with `python -m jaxil.collect`, or name another file"
+
+_logger = logging.getLogger(__name__)
+
+
+class DemonstrationError(ValueError):
+    """Demonstrations cannot be used; says which file, why, and what helps."""
+
+
+class StateDemonstrations(NamedTuple):
+    """What a demonstration file holds.
+
+    Attributes:
+      qpos: positions, float64 [K, T + 1, nq].
+      qvel: velocities, float64 [K, T + 1, nv].
+      act: activations of the actuators, float64 [K, T + 1, na].
+      actions: float32 [K, T, A], in [-1, 1].
+      rewards: the task's, summed over the action repeat. float32 [K, T].
+      metadata: see `new_metadata`.
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    act: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    metadata: dict[str, Any]
+
+
+class Demonstrations(NamedTuple):
+    """Expert episodes as the agent would see them.
+
+    Attributes:
+      frames: single images, uint8 [K, N + 1, H, W, 3], or, where the agent observes
+        states, float32 [K, N + 1, S].
+      actions: float32 [K, N, A]; only for methods that may see them.
+      task_rewards: float32 [K, N]; only to be logged.
+      metadata: the file's, with `file`, and `action_repeat` and `returns` as served.
+    """
+
+    frames: np.ndarray
+    actions: np.ndarray
+    task_rewards: np.ndarray
+    metadata: dict[str, Any]
+
+
+def new_metadata(
+    *,
+    task: str,
+    action_repeat: int,
+    seed: int,
+    first_episode: int,
+    expert: str,
+    rewards: np.ndarray,
+    camera: int | None = None,
+) -> dict[str, Any]:
+    """Returns the metadata of freshly recorded demonstrations.
+
+    Args:
+      task: `domain_task`.
+      action_repeat: environment frames per stored step.
+      seed: the recording environment's; with the episode's number it restores what
+        a task draws at random beyond the state.
+      first_episode: number of episode 0; the others follow it without a gap.
+      expert: how the expert was made, for people.
+      rewards: task rewards. Shape [K, T].
+      camera: what the expert was looked at through; None for `camera_of(task)`.
+    """
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "task": task,
+        "action_repeat": action_repeat,
+        "camera": environments.camera_of(task) if camera is None else camera,
+        "versions": {
+            **environments.simulator_versions(),
+            "jaxil": importlib.metadata.version("jaxil"),
+        },
+        "seed": seed,
+        "first_episode": first_episode,
+        "expert": expert,
+        "returns": np.asarray(rewards, np.float64).sum(axis=1).tolist(),
+    }
+
+
+def shipped_tasks() -> tuple[str, ...]:
+    """Returns the tasks whose demonstrations are part of the package, sorted."""
+    return tuple(sorted(path.stem for path in _shipped_folder().glob("*.npz")))
+
+
+def shipped_path(task: str) -> pathlib.Path:
+    """Returns the package's own demonstrations of `task`.
+
+    Raises:
+      DemonstrationError: none are shipped for it.
+    """
+    path = _shipped_folder() / f"{task}.npz"
+    if task not in shipped_tasks():
+        raise DemonstrationError(
+            f"no demonstrations of {task} are shipped, only of: "
+            f"{', '.join(shipped_tasks()) or 'no task'}. Record some with "
+            "`python -m jaxil.collect` and name the file in demonstrations.source."
+        )
+    return path
+
+
+def write_states(path: str | os.PathLike, demonstrations: StateDemonstrations) -> None:
+    """Writes a demonstration file, whole or not at all.
+
+    Raises:
+      DemonstrationError: the arrays or the metadata break the format's rules.
+    """
+    path = pathlib.Path(path)
+    _check(path, demonstrations)
+    arrays = {
+        name: getattr(demonstrations, name).astype(dtype)
+        for name, (dtype, _, _) in _ARRAYS.items()
+    }
+    arrays["metadata"] = np.array(json.dumps(demonstrations.metadata))
+    archive.write_archive(path, arrays)
+
+
+def read_states(
+    path: str | os.PathLike, *, task: str | None = None, num_episodes: int | None = None
+) -> StateDemonstrations:
+    """Reads a demonstration file and checks all of it; nothing is drawn.
+
+    Args:
+      path: the file.
+      task: the task that it must be of; None takes any.
+      num_episodes: how many episodes to return, the first ones; None for all.
+
+    Raises:
+      DemonstrationError: the file cannot be read, is not one of demonstrations,
+        is damaged, or is not what was asked for.
+    """
+    path = pathlib.Path(path)
+    limits = dict.fromkeys(_ARRAYS, archive.MAX_MEMBER_BYTES)
+    limits["metadata"] = _MAX_METADATA_BYTES
+    try:
+        arrays = archive.read_archive(path, max_bytes=limits)
+        metadata = json.loads(str(arrays.pop("metadata")))
+    except OSError as error:
+        raise _fault(
+            path,
+            f"cannot be read ({error.strerror or error})",
+            "Check the path in demonstrations.source",
+        ) from error
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise _fault(path, f"has metadata that are not JSON ({error})") from error
+    except ValueError as error:
+        raise _fault(path, str(error)) from error
+    demonstrations = StateDemonstrations(**arrays, metadata=metadata)
+    _check(path, demonstrations)
+    if task is not None and metadata["task"] != task:
+        raise _fault(
+            path,
+            f"shows {metadata['task']}, but the task is {task}",
+            "Set the one to the other's",
+        )
+    stored = len(demonstrations.rewards)
+    if num_episodes is None:
+        return demonstrations
+    if not 1 <= num_episodes <= stored:
+        raise _fault(
+            path,
+            f"holds {stored} episodes, and num_episodes={num_episodes} were asked for",
+            f"Ask for 1 to {stored}",
+        )
+    kept = [array[:num_episodes] for array in demonstrations[:-1]]
+    metadata = {**metadata, "returns": metadata["returns"][:num_episodes]}
+    return StateDemonstrations(*kept, metadata=metadata)
+
+
+def check(
+    source: str | os.PathLike, *, task: str, num_episodes: int, action_repeat: int
+) -> None:
+    """Finds out whether `load` would succeed, without drawing anything.
+
+    Raises:
+      DemonstrationError: as `load`.
+    """
+    path = pathlib.Path(source) if str(source) else shipped_path(task)
+    states = read_states(path, task=task, num_episodes=num_episodes)
+    _stride(path, states.metadata["action_repeat"], action_repeat)
+
+
+def load(
+    source: str | os.PathLike,
+    *,
+    task: str,
+    num_episodes: int,
+    action_repeat: int,
+    image_size: int,
+    render_quality: str,
+    observation: str = "pixels",
+    cache: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> Demonstrations:
+    """Loads demonstrations as the agent's own environment would show them.
+
+    Args:
+      source: a demonstration file; "" for the task's shipped one.
+      task: `domain_task`.
+      num_episodes: how many, the file's first ones.
+      action_repeat: the agent's; a multiple of the file's. Of the steps that become
+        one, rewards are summed and the first one's action stands for all.
+      image_size: height and width in pixels.
+      render_quality: "paper" or "fast".
+      observation: "pixels" or "state".
+      cache: whether to keep the images, in `rendering.cache_folder()`.
+      progress: called with (images drawn, images in all) when anything is drawn.
+
+    Raises:
+      DemonstrationError: see `read_states`; or the action repeats don't fit.
+    """
+    path = pathlib.Path(source) if str(source) else shipped_path(task)
+    states = read_states(path, task=task, num_episodes=num_episodes)
+    stride = _stride(path, states.metadata["action_repeat"], action_repeat)
+    num_steps = states.rewards.shape[1] // stride
+    if num_steps < 1:
+        raise _fault(
+            path,
+            f"has episodes shorter than one step of action_repeat={action_repeat}",
+            "Choose a smaller action_repeat",
+        )
+    _warn_of_versions(path, states.metadata["versions"])
+    steps = slice(0, num_steps * stride + 1, stride)
+    try:
+        frames = rendering.observe_episodes(
+            {name: getattr(states, name)[:, steps] for name in ("qpos", "qvel", "act")},
+            task=task,
+            seed=states.metadata["seed"],
+            first_episode=states.metadata["first_episode"],
+            image_size=image_size,
+            render_quality=render_quality,
+            observation=observation,
+            cache=cache,
+            progress=progress,
+        )
+    except ValueError as error:
+        raise _fault(path, f"cannot be shown ({error})") from error
+    used = states.rewards[:, : num_steps * stride]
+    task_rewards = used.reshape(num_episodes, num_steps, stride).sum(2)
+    metadata = {
+        **states.metadata,
+        "file": str(path),
+        "action_repeat": action_repeat,
+        "returns": task_rewards.astype(np.float64).sum(axis=1).tolist(),
+    }
+    actions = states.actions[:, : num_steps * stride : stride]
+    return Demonstrations(frames, actions, task_rewards, metadata)
+
+
+def _shipped_folder() -> pathlib.Path:
+    return pathlib.Path(__file__).parent.parent / "demonstrations"
+
+
+def _fault(
+    path: pathlib.Path, fault: str, way_out: str = _REMAKE
+) -> DemonstrationError:
+    return DemonstrationError(f"{path} {fault}. {way_out}.")
+
+
+def _check(path: pathlib.Path, demonstrations: StateDemonstrations) -> None:
+    """Raises DemonstrationError where arrays or metadata break the format's rules."""
+    fault = _metadata_fault(demonstrations.metadata) or _array_fault(demonstrations)
+    if fault is not None:
+        raise _fault(path, fault)
+
+
+def _metadata_fault(metadata: Any) -> str | None:
+    if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
+        return "is not a file of demonstrations: its metadata lack the format's name"
+    if metadata.get("version") != VERSION:
+        return (
+            f"has version {metadata.get('version')!r} of the format, where this program "
+            f"reads version {VERSION}"
+        )
+    for name, kind in _METADATA.items():
+        value = metadata.get(name)
+        if not isinstance(value, kind) or isinstance(value, bool):
+            return f"has metadata {name}={value!r}, where {kind.__name__} is expected"
+    for name, least in (("action_repeat", 1), ("seed", 0), ("first_episode", 0)):
+        if metadata[name] < least:
+            return f"has metadata {name}={metadata[name]}, which is below {least}"
+    return None
+
+
+def _array_fault(demonstrations: StateDemonstrations) -> str | None:
+    rewards = demonstrations.rewards
+    if rewards.ndim != 2 or 0 in rewards.shape:
+        return f"has rewards of shape {rewards.shape}, where [K, T] is expected"
+    num_episodes, num_steps = rewards.shape
+    for name, (dtype, num_axes, extra) in _ARRAYS.items():
+        array = getattr(demonstrations, name)
+        if array.dtype != dtype:
+            return f"has {name} of type {array.dtype}, where {dtype} is expected"
+        if array.ndim != num_axes or array.shape[:2] != (
+            num_episodes,
+            num_steps + extra,
+        ):
+            return (
+                f"has {name} of shape {array.shape}, which does not fit rewards of "
+                f"shape {rewards.shape}"
+            )
+        if not np.isfinite(array).all():
+            episode = int(np.argwhere(~np.isfinite(array))[0, 0])
+            return f"has a NaN or infinity in {name}, episode {episode}"
+    returns = demonstrations.metadata["returns"]
+    numbers = all(isinstance(value, int | float) for value in returns)
+    if (
+        len(returns) != num_episodes
+        or not numbers
+        or not all(map(math.isfinite, returns))
+    ):
+        return f"has metadata returns={returns!r}, where {num_episodes} numbers belong"
+    return None
+
+
+def _stride(path: pathlib.Path, recorded: int, wanted: int) -> int:
+    if wanted < 1 or wanted % recorded:
+        raise _fault(
+            path,
+            f"was recorded with action_repeat={recorded}, which cannot serve "
+            f"action_repeat={wanted}",
+            f"Take a multiple of {recorded}, or record it again",
+        )
+    return wanted // recorded
+
+
+def _warn_of_versions(path: pathlib.Path, recorded: dict[str, str]) -> None:
+    installed = environments.simulator_versions()
+    differing = [
+        f"{name} {recorded.get(name)} (here {version})"
+        for name, version in installed.items()
+        if recorded.get(name) != version
+    ]
+    if differing:
+        _logger.warning(
+            "%s was recorded with %s: its images are drawn here, but the task may move "
+            "or look slightly different now.",
+            path,
+            ", ".join(differing),
+        )
+
+
+def sample(
+    demonstrations: Demonstrations,
+    rng: np.random.Generator,
+    batch_size: int,
+    *,
+    frame_stack: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draws expert observations with the actions taken there, uniformly.
+
+    Args:
+      demonstrations: whole episodes of single frames.
+      rng: source of the draw.
+      batch_size: B.
+      frame_stack: frames in an observation; an episode's first frame stands in for
+        those before it.
+
+    Returns:
+      Observations uint8 [B, H, W, 3 * frame_stack] or float32 [B, S], and actions
+      [B, A].
+    """
+    num_episodes, num_steps = demonstrations.actions.shape[:2]
+    episodes = rng.integers(num_episodes, size=batch_size)
+    steps = rng.integers(num_steps, size=batch_size)
+    stack = [
+        demonstrations.frames[episodes, np.maximum(steps - age, 0)]
+        for age in range(frame_stack - 1, -1, -1)
+    ]
+    return np.concatenate(stack, axis=-1), demonstrations.actions[episodes, steps]

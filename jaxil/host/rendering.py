@@ -1,0 +1,159 @@
+"""Images of stored simulator states, drawn once per machine and then cached."""
+
+import hashlib
+import json
+import logging
+import os
+import pathlib
+import tempfile
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxil.host import environment as environments
+
+# Part of each key: raise it when drawing changes in a way that the key can't see.
+_CACHE_VERSION = 1
+
+_logger = logging.getLogger(__name__)
+
+
+def cache_folder() -> pathlib.Path:
+    """Returns the folder of what can be computed again; it need not exist.
+
+    $JAXIL_CACHE, else `jaxil` in the user's cache folder.
+    """
+    own = os.environ.get("JAXIL_CACHE")
+    if own:
+        return pathlib.Path(own).expanduser()
+    shared = os.environ.get("XDG_CACHE_HOME")
+    return pathlib.Path(shared or "~/.cache").expanduser() / "jaxil"
+
+
+def observe_episodes(
+    states: Mapping[str, np.ndarray],
+    *,
+    task: str,
+    seed: int,
+    first_episode: int,
+    image_size: int,
+    render_quality: str,
+    observation: str = "pixels",
+    cache: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> np.ndarray:
+    """Shows stored episodes as the agent's own environment would.
+
+    Args:
+      states: `qpos`, `qvel` and `act`, each of shape [K, N + 1, n].
+      task: `domain_task`.
+      seed: of the environment that recorded them.
+      first_episode: number of episode 0 there. With the seed it restores what the
+        states don't hold: targets, terrain.
+      image_size: height and width in pixels.
+      render_quality: "paper" or "fast".
+      observation: "pixels" or "state".
+      cache: whether images are looked up in, and added to, `cache_folder()`.
+      progress: called with (images drawn, images in all), if any have to be.
+
+    Returns:
+      Images, uint8 [K, N + 1, H, W, 3], or states, float32 [K, N + 1, S].
+
+    Raises:
+      ValueError: the states don't fit the task's model, or see `make_environment`.
+      RuntimeError: nothing here can render.
+    """
+    environment = environments.make_environment(
+        task,
+        seed=seed,
+        image_size=image_size,
+        frame_stack=1,
+        render_quality=render_quality,
+        observation=observation,
+    )
+    try:
+        spec = environment.observation_spec()
+        num_episodes, length = states["qpos"].shape[:2]
+        observed = np.empty((num_episodes, length, *spec.shape), spec.dtype)
+        caches = cache and observation == "pixels"
+        about = {
+            "task": task,
+            "seed": seed,
+            "image_size": image_size,
+            "render_quality": render_quality,
+            "camera": environments.camera_of(task),
+            "versions": environments.simulator_versions(),
+            "gl": environment.renderer.gl_name() if caches else "",
+        }
+        num_drawn = 0
+        for index in range(num_episodes):
+            number = first_episode + index
+            episode = {name: array[index] for name, array in states.items()}
+            path = _cache_path({**about, "episode": number}, episode)
+            found = _read_cached(path, observed[index]) if caches else None
+            if found is not None:
+                observed[index] = found
+                num_drawn += length
+                continue
+            environment.reset(episode=number)
+            for time in range(length):
+                environment.set_simulator_state(
+                    **{name: array[time] for name, array in episode.items()}
+                )
+                observed[index, time] = environment.single_observation()
+                num_drawn += 1
+                if progress is not None:
+                    progress(num_drawn, num_episodes * length)
+            if caches:
+                _write_cached(path, observed[index])
+    finally:
+        environment.close()
+    return observed
+
+
+def _cache_path(
+    about: dict[str, Any], states: Mapping[str, np.ndarray]
+) -> pathlib.Path:
+    """Returns a file whose name changes with all that changes an episode's pixels."""
+    about = {**about, "cache_version": _CACHE_VERSION}
+    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
+    for name, array in sorted(states.items()):
+        digest.update(f"{name}{array.dtype.str}{array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    name = f"{about['task']}-{digest.hexdigest()[:24]}.npy"
+    return cache_folder() / "frames" / name
+
+
+def _read_cached(path: pathlib.Path, like: np.ndarray) -> np.ndarray | None:
+    """Returns the array at `path`; None unless it is whole and shaped `like`."""
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError):
+        return None
+    if getattr(array, "shape", None) != like.shape or array.dtype != like.dtype:
+        return None
+    return array
+
+
+def _write_cached(path: pathlib.Path, array: np.ndarray) -> None:
+    """Stores `array` whole or not at all; where that fails, says so and goes on.
+
+    Several processes may store the same: each renames a file of its own over it.
+    """
+    temporary = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, suffix=".part")
+        temporary = pathlib.Path(name)
+        with os.fdopen(handle, "wb") as file:
+            np.save(file, array, allow_pickle=False)
+        temporary.replace(path)
+    except OSError as error:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+        _logger.warning(
+            "images are not cached, so the next run draws them again: %s. "
+            "JAXIL_CACHE=DIR names another folder.",
+            error,
+        )

@@ -1,0 +1,104 @@
+"""Videos of an episode, the agent beside the expert."""
+
+import os
+import pathlib
+import uuid
+
+import numpy as np
+
+_LEAST_HEIGHT = 256  # pixels; smaller frames are enlarged by a whole factor
+_GAP = 8  # pixels between the two pictures
+_CAPTION = 22  # pixels, the strip above them that says who is who
+
+
+def write_video(
+    path: str | os.PathLike,
+    frames_left: np.ndarray,
+    frames_right: np.ndarray | None = None,
+    *,
+    fps: float,
+    labels: tuple[str, str] = ("agent", "expert"),
+) -> None:
+    """Writes an MP4 of one episode, or of two side by side.
+
+    The shorter episode stands still at its last frame until the longer one ends. Pixels
+    are repeated, not blurred, so that the picture shows what the agent sees.
+
+    Args:
+      path: the file, ending in .mp4; it is replaced as a whole.
+      frames_left: [T, H, W, 3] uint8, T >= 1.
+      frames_right: [T', H, W, 3] uint8 of the same size, or None.
+      fps: frames per second of the video, > 0, rounded to a whole number.
+      labels: captions of the left and right picture.
+
+    Raises:
+      ValueError: for a wrong shape or dtype.
+      OSError: if the file cannot be written.
+    """
+    sides = [frames_left] if frames_right is None else [frames_left, frames_right]
+    for name, frames in zip(("frames_left", "frames_right"), sides, strict=False):
+        if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8:
+            raise ValueError(
+                f"{name} = {frames.dtype} {frames.shape}: expected uint8 [T, H, W, 3]"
+            )
+        if not len(frames) or frames.shape[1:] != frames_left.shape[1:]:
+            raise ValueError(
+                f"{name}.shape = {frames.shape}: expected at least one frame,"
+                f" of {frames_left.shape[1:]}"
+            )
+    if not fps > 0:
+        raise ValueError(f"fps = {fps}: expected > 0")
+
+    import imageio_ffmpeg  # starts a search for the ffmpeg binary
+
+    canvas, corners, factor = _canvas(frames_left.shape[1:3], labels[: len(sides)])
+    path = pathlib.Path(path)
+    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp.mp4")
+    height, width = canvas.shape[:2]
+    writer = imageio_ffmpeg.write_frames(
+        str(temporary),
+        (width, height),
+        fps=max(1, round(fps)),
+        quality=8,
+        macro_block_size=2,  # H.264 with 4:2:0 colours wants even sizes, no more
+        ffmpeg_log_level="error",
+    )
+    try:
+        writer.send(None)
+        for step in range(max(map(len, sides))):
+            for frames, (row, column) in zip(sides, corners, strict=True):
+                frame = frames[min(step, len(frames) - 1)]
+                big = frame.repeat(factor, axis=0).repeat(factor, axis=1)
+                canvas[row : row + big.shape[0], column : column + big.shape[1]] = big
+            writer.send(np.ascontiguousarray(canvas))
+        writer.close()
+        os.replace(temporary, path)
+    finally:
+        writer.close()
+        temporary.unlink(missing_ok=True)
+
+
+def _canvas(
+    size: tuple[int, int], labels: tuple[str, ...]
+) -> tuple[np.ndarray, list[tuple[int, int]], int]:
+    """Makes the captioned background.
+
+    Returns:
+      The background [H', W', 3] with even sides, the upper left corner (row, column) of
+      each picture on it, and the whole factor that pictures are enlarged by.
+    """
+    # Pillow comes with imageio.
+    from PIL import Image, ImageDraw
+
+    factor = max(1, -(-_LEAST_HEIGHT // size[0]))
+    height, width = size[0] * factor, size[1] * factor
+    total_height = _CAPTION + height
+    total_width = width * len(labels) + _GAP * (len(labels) - 1)
+    image = Image.new(
+        "RGB", (total_width + total_width % 2, total_height + total_height % 2)
+    )
+    draw = ImageDraw.Draw(image)
+    corners = [(_CAPTION, place * (width + _GAP)) for place in range(len(labels))]
+    for label, (_, column) in zip(labels, corners, strict=True):
+        draw.text((column + 4, 5), label, fill=(235, 235, 235))
+    return np.array(image), corners, factor

@@ -1,0 +1,57 @@
+r"""Trains one agent: imitation from video, or DrQ-v2 on the true reward.
+
+    python -m jaxil.launch --config=configs/pdac_walker.py --workdir=runs/pdac
+    python -m jaxil.launch --config=configs/psil.py:cheetah_run --workdir=runs/psil \
+        --config.seed=3
+
+The same command again goes on where the run stopped.
+"""
+
+import pathlib
+import sys
+
+from absl import flags
+
+from jaxil import command
+
+
+def main(argv: list[str]) -> int:
+    """Runs the command; returns its exit status."""
+    values = command.parse(argv, __doc__ or "", _define)
+    if values.workdir is None:
+        raise command.UsageError(
+            "--workdir is missing: name a folder for the run, such as --workdir=runs/1"
+        )
+    # Before jax and MuJoCo are imported, which the imports below do.
+    from jaxil import platform
+
+    print(platform.prepare(), file=sys.stderr, flush=True)
+
+    from jaxil import experiment, machine, train, workdir
+
+    config = values.config
+    folder = pathlib.Path(values.workdir)
+    faults = experiment.problems(config) + workdir.problems(folder, config)
+    if faults:
+        raise command.UsageError(command.listing(faults))
+    print(machine.memory_sentence(config), file=sys.stderr, flush=True)
+    with workdir.opened(folder):
+        try:
+            gl_name = experiment.renderer_name(config)
+            workdir.write_config(folder, config, machine.describe(gl_name))
+            finished = train.train(config, folder)
+        except train.TrainingDiverged as error:
+            print(f"training stopped: {error}", file=sys.stderr)
+            return 1
+    return 0 if finished else 130
+
+
+def _define(values: flags.FlagValues) -> None:
+    command.define_config(values)
+    flags.DEFINE_string(
+        "workdir", None, "folder of the run; made if missing", flag_values=values
+    )
+
+
+if __name__ == "__main__":
+    command.run(main)

@@ -1,0 +1,89 @@
+"""Learner state: everything that training changes, and nothing else."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax import Array
+
+from jaxil.maths.types import Params
+
+
+class LearnerParams(NamedTuple):
+    """The parameters that rewarders and policies may read.
+
+    Attributes:
+      encoder: shared pixel encoder.
+      actor: policy.
+      critic: live twin critics.
+    """
+
+    encoder: Params
+    actor: Params
+    critic: Params
+
+
+@struct.dataclass
+class ModuleState:
+    """Parameters of one network with the state of its optimiser."""
+
+    params: Params
+    opt_state: optax.OptState
+
+
+@struct.dataclass
+class TrainState:
+    """All that `update_step` reads and writes; a pytree, donated at each call.
+
+    Hyperparameters are absent on purpose: the update closes over them, so a
+    checkpoint holds learned values only.
+
+    Attributes:
+      encoder: trained by the critic loss alone.
+      actor: trained by the actor loss.
+      critic: trained by the critic loss.
+      target_critic: slow copy of the critic's parameters.
+      rewarder: what the imitation method learns or remembers.
+      key: base random key. Never consumed: update number n uses
+        `fold_in(key, n)`, so a resumed run repeats the draws of an unbroken one.
+      num_updates: gradient steps done so far. Shape [], int32.
+    """
+
+    encoder: ModuleState
+    actor: ModuleState
+    critic: ModuleState
+    target_critic: Params
+    rewarder: Any
+    key: Array
+    num_updates: Array
+
+    @property
+    def params(self) -> LearnerParams:
+        """The live parameters, for policies and rewarders."""
+        return LearnerParams(
+            self.encoder.params, self.actor.params, self.critic.params
+        )
+
+
+def init_module(params: Params, optimiser: optax.GradientTransformation) -> ModuleState:
+    """Returns fresh optimiser statistics around `params`."""
+    return ModuleState(params=params, opt_state=optimiser.init(params))
+
+
+def apply_gradients(
+    module: ModuleState, gradients: Params, optimiser: optax.GradientTransformation
+) -> ModuleState:
+    """Returns `module` after one optimiser step."""
+    updates, opt_state = optimiser.update(gradients, module.opt_state, module.params)
+    params = optax.apply_updates(module.params, updates)
+    return ModuleState(params=params, opt_state=opt_state)
+
+
+def copy_params(params: Params) -> Params:
+    """Returns the same values in buffers of their own.
+
+    Two trees that share buffers cannot both be donated to one call.
+    """
+    return jax.tree.map(jnp.copy, params)

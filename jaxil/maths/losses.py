@@ -1,0 +1,126 @@
+"""Losses and targets on arrays."""
+
+from collections.abc import Callable
+
+import chex
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+_NORM_FLOOR = 1e-12  # under the root: d|g|/dg is undefined at g = 0
+
+
+def td_target(reward: Array, discount: Array, next_values: Array) -> Array:
+    """Returns the clipped double-Q target over n steps.
+
+        y = R_n + gamma^n * min_k Q_k(o', a')
+
+    Args:
+      reward: R_n, discounted sum of the window's rewards. Shape [B].
+      discount: gamma^n times the environment's discounts; 0 after a true
+        termination, never after a time limit. Shape [B], in [0, 1].
+      next_values: both target critics after the window. Shape [2, B].
+
+    Returns:
+      Targets, without gradient. Shape [B].
+
+    Source: Yarats et al. 2021, arXiv:2107.09645, eq. (1).
+    """
+    chex.assert_rank([reward, discount, next_values], [1, 1, 2])
+    chex.assert_equal_shape([reward, discount, next_values[0]])
+    bootstrap = jnp.min(next_values, axis=0)
+    return jax.lax.stop_gradient(reward + discount * bootstrap)
+
+
+def critic_loss(values: Array, target: Array) -> Array:
+    """Returns the summed mean squared errors of both critics.
+
+        L = sum_k mean_b (Q_k - y)^2
+
+    Args:
+      values: shape [2, B].
+      target: shape [B].
+
+    Source: Yarats et al. 2021, arXiv:2107.09645, eq. (1); no factor 1/2, as in the
+    authors' code.
+    """
+    chex.assert_rank([values, target], [2, 1])
+    chex.assert_equal_shape([values[0], target])
+    return jnp.sum(jnp.mean(jnp.square(values - target[None]), axis=1))
+
+
+def actor_loss(values: Array) -> Array:
+    """Returns minus the mean of the smaller critic at the actor's own actions.
+
+    Args:
+      values: shape [2, B].
+
+    Source: Yarats et al. 2021, arXiv:2107.09645, eq. (2).
+    """
+    chex.assert_rank(values, 2)
+    return -jnp.mean(jnp.min(values, axis=0))
+
+
+def saturation_penalty(pre_tanh: Array) -> Array:
+    """Returns the mean square of the actor's mean before its tanh.
+
+    Where |pre-tanh| is large, the gradient of tanh vanishes and an actor stays at
+    a constant, saturated action for good. Not part of the paper: weight 0 there.
+
+    Args:
+      pre_tanh: shape [B, A].
+    """
+    chex.assert_rank(pre_tanh, 2)
+    return jnp.mean(jnp.square(pre_tanh))
+
+
+def discriminator_loss(expert_logits: Array, agent_logits: Array) -> Array:
+    """Returns binary cross-entropy with label 1 for the expert.
+
+    With logits l = log D - log(1 - D):  -log D = softplus(-l)  and
+    -log(1 - D) = softplus(l), both finite for every l.
+
+    Args:
+      expert_logits: on demonstrations. Shape [B].
+      agent_logits: on replay. Shape [B].
+
+    Returns:
+      Mean over the expert's plus mean over the agent's. Shape [].
+
+    Source: Cohen et al. 2021, eq. (7), with the labels that eq. (8) needs: read
+    literally, the two would reward looking unlike the expert.
+    """
+    chex.assert_rank([expert_logits, agent_logits], 1)
+    chex.assert_equal_shape([expert_logits, agent_logits])
+    expert_term = jnp.mean(jax.nn.softplus(-expert_logits))
+    agent_term = jnp.mean(jax.nn.softplus(agent_logits))
+    return expert_term + agent_term
+
+
+def gradient_penalty(
+    logits: Callable[[Array], Array], expert: Array, agent: Array, key: Array
+) -> Array:
+    """Returns the mean squared distance of the input gradient's norm from one.
+
+        x_i = u_i e_i + (1 - u_i) a_i,   u_i ~ Uniform(0, 1)
+        L   = mean_i (|d l(x_i) / d x_i| - 1)^2
+
+    Args:
+      logits: discriminator of a batch, [B, D] -> [B], each row by itself.
+      expert: discriminator inputs of demonstrations. Shape [B, D].
+      agent: discriminator inputs of the agent. Shape [B, D].
+      key: consumed.
+
+    Returns:
+      The penalty without its weight. Shape [].
+
+    Source: Gulrajani et al. 2017, arXiv:1704.00028, eq. (3).
+    """
+    chex.assert_rank([expert, agent], 2)
+    chex.assert_equal_shape([expert, agent])
+    mix = jax.random.uniform(key, (expert.shape[0], 1), expert.dtype)
+    between = mix * expert + (1.0 - mix) * agent
+    # Rows do not see each other, so the gradient of the sum holds every row's own.
+    gradients = jax.grad(lambda x: jnp.sum(logits(x)))(between)
+    norms = jnp.sqrt(jnp.sum(jnp.square(gradients), axis=1) + _NORM_FLOOR)
+    return jnp.mean(jnp.square(norms - 1.0))

@@ -1,0 +1,71 @@
+"""Names for the values that travel between the floors.
+
+Axes, everywhere in this project: B batch, T agent time, N expert time,
+K demonstrations, H W C pixels (channels last, the stack folded into C),
+S state vector, R representation, D feature, A action.
+"""
+
+from typing import Any, NamedTuple
+
+from jax import Array
+
+Params = Any  # a pytree of arrays, as flax makes it
+Metrics = dict[str, Array]  # scalars, left on the device until they are logged
+
+
+class Batch(NamedTuple):
+    """Sampled transitions, n environment decisions long.
+
+    Attributes:
+      observation: uint8 [B, H, W, C], or float32 [B, S] for state vectors.
+      action: first action of each window, in [-1, 1]. Shape [B, A].
+      reward: discounted sum of the window's rewards. Shape [B].
+      discount: product of environment discounts and gamma^n. Shape [B].
+      next_observation: observation after the window, like `observation`.
+    """
+
+    observation: Array
+    action: Array
+    reward: Array
+    discount: Array
+    next_observation: Array
+
+
+class ExpertBatch(NamedTuple):
+    """Observations sampled from the demonstrations.
+
+    Attributes:
+      observation: uint8 [B, H, W, C], or float32 [B, S].
+      action: what the expert did there. Shape [B, A]. Read only by methods that
+        say that they see actions.
+    """
+
+    observation: Array
+    action: Array
+
+
+class Episode(NamedTuple):
+    """One finished episode of the agent, frames not stacked.
+
+    Attributes:
+      frames: uint8 [T + 1, H, W, 3], or float32 [T + 1, S]; the first one is the
+        observation at reset.
+      actions: shape [T, A].
+      task_rewards: the environment's own rewards. Shape [T].
+    """
+
+    frames: Array
+    actions: Array
+    task_rewards: Array
+
+
+class ExpertEpisodes(NamedTuple):
+    """The demonstrations, frames not stacked.
+
+    Attributes:
+      frames: uint8 [K, N + 1, H, W, 3], or float32 [K, N + 1, S].
+      actions: shape [K, N, A].
+    """
+
+    frames: Array
+    actions: Array

@@ -1,0 +1,34 @@
+"""The policy network."""
+
+import flax.linen as nn
+from jax import Array
+
+from jaxil.networks.layers import MLP, Trunk
+
+
+class Actor(nn.Module):
+    """Trunk and MLP towards the mean action, before its tanh.
+
+    Attributes:
+      action_dim: A.
+      feature_dim: D, size of the trunk's output.
+      hidden_dim: width of the MLP.
+
+    Source: facebookresearch/drqv2, drqv2.py, `Actor`.
+    """
+
+    action_dim: int
+    feature_dim: int
+    hidden_dim: int
+
+    def setup(self) -> None:
+        self.trunk = Trunk(self.feature_dim)
+        self.head = MLP(self.hidden_dim, self.action_dim)
+
+    def __call__(self, representation: Array) -> Array:
+        """Maps [B, R] to the mean before tanh, [B, A]."""
+        return self.head(self.features(representation))
+
+    def features(self, representation: Array) -> Array:
+        """Maps [B, R] to the trunk's features, [B, D]: P-SIL's metric space."""
+        return self.trunk(representation)

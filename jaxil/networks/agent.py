@@ -1,0 +1,84 @@
+"""Encoder, actor and critic together: the networks of one agent."""
+
+from typing import Any, NamedTuple
+
+from jax import Array
+
+from jaxil.maths.types import Params
+from jaxil.networks.actor import Actor
+from jaxil.networks.critic import Critic
+from jaxil.networks.encoder import PixelEncoder, StateEncoder
+
+
+class AgentNetworks(NamedTuple):
+    """The three modules; their parameters live in the learner's state."""
+
+    encoder: PixelEncoder | StateEncoder
+    actor: Actor
+    critic: Critic
+
+
+def make_agent_networks(
+    *,
+    action_dim: int,
+    feature_dim: int,
+    hidden_dim: int,
+    observation: str,
+    channels: tuple[int, ...],
+    kernel_sizes: tuple[int, ...],
+    strides: tuple[int, ...],
+    contrast: float,
+    mean: Any,
+) -> AgentNetworks:
+    """Returns the networks of DrQ-v2.
+
+    Args:
+      action_dim: A.
+      feature_dim: D, output of both trunks.
+      hidden_dim: width of the actor's and the critics' MLPs.
+      observation: "pixels" or "state".
+      channels: of the convolutions, as are the next two.
+      kernel_sizes: see `PixelEncoder`.
+      strides: see `PixelEncoder`.
+      contrast: see `PixelEncoder`.
+      mean: see `PixelEncoder`.
+    """
+    if observation == "state":
+        encoder = StateEncoder()
+    else:
+        encoder = PixelEncoder(channels, kernel_sizes, strides, contrast, mean)
+    return AgentNetworks(
+        encoder=encoder,
+        actor=Actor(action_dim, feature_dim, hidden_dim),
+        critic=Critic(feature_dim, hidden_dim),
+    )
+
+
+def actor_features(
+    networks: AgentNetworks,
+    encoder_params: Params,
+    actor_params: Params,
+    observation: Array,
+) -> Array:
+    """Returns trunk features of the actor. [B, H, W, C] to [B, D]."""
+    representation = networks.encoder.apply(encoder_params, observation)
+    features = networks.actor.apply(
+        actor_params, representation, method=networks.actor.features
+    )
+    assert isinstance(features, Array)  # flax types the result as any collection
+    return features
+
+
+def critic_features(
+    networks: AgentNetworks,
+    encoder_params: Params,
+    critic_params: Params,
+    observation: Array,
+) -> Array:
+    """Returns trunk features of the critic. [B, H, W, C] to [B, D]."""
+    representation = networks.encoder.apply(encoder_params, observation)
+    features = networks.critic.apply(
+        critic_params, representation, method=networks.critic.features
+    )
+    assert isinstance(features, Array)
+    return features

@@ -1,0 +1,78 @@
+"""From observations to the representation that actor and critic share."""
+
+import math
+from typing import Any
+
+import chex
+import flax.linen as nn
+import jax.numpy as jnp
+from jax import Array
+
+from jaxil.maths import convolution
+
+
+class PixelEncoder(nn.Module):
+    """A stack of VALID convolutions with ReLU, flattened.
+
+        x = contrast * (pixels / 255 - mean)
+
+    Attributes:
+      channels: output channels of each layer.
+      kernel_sizes: side of each layer's square kernel.
+      strides: stride of each layer.
+      contrast: factor on the centred pixels; 1 in the paper.
+      mean: what is subtracted, in [0, 1]: 0.5 in the paper, or an image
+        [H, W, C] as nested tuples or an array.
+
+    Source: facebookresearch/drqv2, drqv2.py, `Encoder`.
+    """
+
+    channels: tuple[int, ...] = (32, 32, 32, 32)
+    kernel_sizes: tuple[int, ...] = (3, 3, 3, 3)
+    strides: tuple[int, ...] = (2, 1, 1, 1)
+    contrast: float = 1.0
+    mean: Any = 0.5
+
+    @nn.compact
+    def __call__(self, observation: Array) -> Array:
+        """Maps uint8 [B, H, W, C] to float32 [B, R]."""
+        chex.assert_rank(observation, 4)
+        x = observation.astype(jnp.float32) / 255.0
+        x = self.contrast * (x - jnp.asarray(self.mean, jnp.float32))
+        layers = zip(self.channels, self.kernel_sizes, self.strides, strict=True)
+        for features, size, stride in layers:
+            x = nn.Conv(
+                features,
+                kernel_size=(size, size),
+                strides=(stride, stride),
+                padding="VALID",
+                kernel_init=nn.initializers.orthogonal(scale=math.sqrt(2.0)),
+                conv_general_dilated=convolution.convolve,
+            )(x)
+            x = nn.relu(x)
+        return x.reshape(x.shape[0], -1)
+
+
+class StateEncoder(nn.Module):
+    """Passes state vectors on as they are: for experts that learn without pixels."""
+
+    @nn.compact
+    def __call__(self, observation: Array) -> Array:
+        """Maps [B, S] to [B, S]."""
+        chex.assert_rank(observation, 2)
+        return observation.astype(jnp.float32)
+
+
+def output_side(
+    side: int, kernel_sizes: tuple[int, ...], strides: tuple[int, ...]
+) -> int:
+    """Returns the side of the last feature map; below 1 the image is too small.
+
+    Args:
+      side: height or width of the image, in pixels.
+      kernel_sizes: as in `PixelEncoder`.
+      strides: as in `PixelEncoder`.
+    """
+    for size, stride in zip(kernel_sizes, strides, strict=True):
+        side = (side - size) // stride + 1
+    return side

@@ -1,0 +1,57 @@
+"""Building blocks that several networks share."""
+
+import chex
+import flax.linen as nn
+import jax.numpy as jnp
+from jax import Array
+
+_LAYER_NORM_EPSILON = 1e-5  # PyTorch's default; flax's own is 1e-6
+
+
+def dense(features: int, name: str | None = None) -> nn.Dense:
+    """Returns a linear layer, orthogonal with gain 1 and bias 0.
+
+    Source: facebookresearch/drqv2, utils.py, `weight_init`.
+    """
+    return nn.Dense(features, kernel_init=nn.initializers.orthogonal(), name=name)
+
+
+class Trunk(nn.Module):
+    """Squeezes a representation into a few bounded features.
+
+        h = tanh(LayerNorm(W x + b))
+
+    Attributes:
+      feature_dim: D, number of features.
+
+    Source: facebookresearch/drqv2, drqv2.py, `Actor.trunk`, `Critic.trunk`.
+    """
+
+    feature_dim: int
+
+    @nn.compact
+    def __call__(self, representation: Array) -> Array:
+        """Maps [B, R] to [B, D], in [-1, 1]."""
+        chex.assert_rank(representation, 2)
+        x = dense(self.feature_dim, name="project")(representation)
+        x = nn.LayerNorm(epsilon=_LAYER_NORM_EPSILON, name="normalise")(x)
+        return jnp.tanh(x)
+
+
+class MLP(nn.Module):
+    """Two hidden ReLU layers and a linear output.
+
+    Attributes:
+      hidden_dim: width of both hidden layers.
+      output_dim: width of the output.
+    """
+
+    hidden_dim: int
+    output_dim: int
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        """Maps [B, X] to [B, output_dim]."""
+        x = nn.relu(dense(self.hidden_dim, name="hidden_1")(x))
+        x = nn.relu(dense(self.hidden_dim, name="hidden_2")(x))
+        return dense(self.output_dim, name="output")(x)

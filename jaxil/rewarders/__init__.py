@@ -1,0 +1,1 @@
+"""Floor 2: imitation methods, one file each, behind `rewarder.Rewarder`."""

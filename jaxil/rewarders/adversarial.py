@@ -1,0 +1,128 @@
+"""P-DAC: rewards from a discriminator on the critic's own features."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+
+from jaxil.learner.state import (
+    LearnerParams,
+    ModuleState,
+    apply_gradients,
+    init_module,
+)
+from jaxil.maths import augmentation, losses
+from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes, Metrics, Params
+from jaxil.networks.agent import AgentNetworks, critic_features
+from jaxil.networks.discriminator import Discriminator
+from jaxil.rewarders.rewarder import AgentView, Rewarder, Spec
+
+
+def make_adversarial_rewarder(
+    networks: AgentNetworks,
+    *,
+    hidden_dim: int,
+    learning_rate: float,
+    penalty_weight: float,
+    batch_size: int,
+    sees_actions: bool,
+    shift_padding: int,
+    frame_stack: int,
+) -> Rewarder:
+    """Returns the rewarder of P-DAC.
+
+        max_D  mean log D(e) + mean log(1 - D(a)) - penalty_weight * GP,    r = logit
+
+    where e and a are critic-trunk features of augmented observations, without
+    gradient into encoder or trunk. log D - log(1 - D), the paper's reward, is the
+    logit itself, and only the logit stays finite in float32.
+
+    Args:
+      networks: of the agent; only the encoder and the critic's trunk are used.
+      hidden_dim: width of the discriminator.
+      learning_rate: of its Adam.
+      penalty_weight: weight of the gradient penalty; 10 in the paper.
+      batch_size: N, expert samples and agent samples in a step.
+      sees_actions: whether actions are appended to the features: D(o_t, a_t).
+      shift_padding: of the random shift; 0 for none.
+      frame_stack: frames in an observation.
+
+    Source: Cohen et al. 2021, sec. 3.2; sizes and rates, which the paper leaves
+    out, from siddhanthaldar/ROT.
+    """
+    discriminator = Discriminator(hidden_dim)
+    optimiser = optax.adam(learning_rate)
+
+    def inputs(features: Array, action: Array) -> Array:
+        if not sees_actions:
+            return features
+        return jnp.concatenate([features, action], axis=-1)
+
+    def logits(params: Params, x: Array) -> Array:
+        output = discriminator.apply(params, x)
+        assert isinstance(output, Array)
+        return output
+
+    def init(key: Array, spec: Spec, learner: LearnerParams) -> ModuleState:
+        del learner
+        width = spec.feature_dim + (spec.action_dim if sees_actions else 0)
+        params = discriminator.init(key, jnp.zeros((1, width)))
+        return init_module(params, optimiser)
+
+    def update(
+        state: ModuleState,
+        learner: LearnerParams,
+        agent: AgentView,
+        expert: ExpertBatch | None,
+        key: Array,
+    ) -> tuple[ModuleState, Metrics]:
+        assert expert is not None
+        chex.assert_axis_dimension(expert.observation, 0, batch_size)
+        shift_key, penalty_key = jax.random.split(key)
+        observation = expert.observation
+        if observation.ndim == 4:
+            observation = augmentation.random_shift(
+                observation, shift_key, padding=shift_padding
+            )
+        features = critic_features(
+            networks, learner.encoder, learner.critic, observation
+        )
+        expert_inputs = jax.lax.stop_gradient(inputs(features, expert.action))
+        agent_inputs = inputs(agent.features[:batch_size], agent.action[:batch_size])
+        agent_inputs = jax.lax.stop_gradient(agent_inputs)
+
+        def loss(params: Params) -> tuple[Array, Metrics]:
+            both = logits(params, jnp.concatenate([expert_inputs, agent_inputs]))
+            expert_logits, agent_logits = both[:batch_size], both[batch_size:]
+            cross_entropy = losses.discriminator_loss(expert_logits, agent_logits)
+            penalty = losses.gradient_penalty(
+                lambda x: logits(params, x), expert_inputs, agent_inputs, penalty_key
+            )
+            metrics = {
+                "discriminator/loss": cross_entropy,
+                "discriminator/penalty": penalty,
+                "discriminator/expert_logit": jnp.mean(expert_logits),
+                "discriminator/agent_logit": jnp.mean(agent_logits),
+            }
+            return cross_entropy + penalty_weight * penalty, metrics
+
+        gradients, metrics = jax.grad(loss, has_aux=True)(state.params)
+        return apply_gradients(state, gradients, optimiser), metrics
+
+    def rewards(
+        state: ModuleState,
+        learner: LearnerParams,
+        episode: Episode,
+        expert_episodes: ExpertEpisodes | None,
+    ) -> tuple[Array, ModuleState]:
+        del expert_episodes
+        observations = augmentation.stack_frames(
+            episode.frames, frame_stack=frame_stack
+        )
+        # r(o_{t+1}), as in the reference; with actions the pair is (o_t, a_t).
+        judged = observations[:-1] if sees_actions else observations[1:]
+        features = critic_features(networks, learner.encoder, learner.critic, judged)
+        return logits(state.params, inputs(features, episode.actions)), state
+
+    return Rewarder(init, update, rewards, samples_expert=True, matches_episodes=False)

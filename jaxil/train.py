@@ -1,0 +1,368 @@
+"""The loop: act, store, reward, learn, look. Read it from top to bottom."""
+
+import dataclasses
+import pathlib
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import ml_collections
+import numpy as np
+
+from jaxil import experiment, outputs
+from jaxil.config import METHODS
+from jaxil.host import demonstrations as host_demonstrations
+from jaxil.host.checkpoint import Checkpoints
+from jaxil.host.evaluation import evaluate
+from jaxil.host.interaction import Decision, FinishedEpisode, interact, join
+from jaxil.host.progress import ProgressLine
+from jaxil.learner.state import TrainState
+from jaxil.maths.types import Batch, Episode, ExpertBatch
+
+# Names of NumPy's random streams: every draw is keyed by (seed, stream, step), so
+# that a resumed run repeats those of an unbroken one without any stored state.
+_UNIFORM_ACTIONS, _SAMPLED_BATCHES = 1, 2
+_EXPLORATION_KEY = 2**32 - 2  # a fold_in number that no update has
+
+
+class TrainingDiverged(RuntimeError):
+    """A loss or reward is no longer a finite number."""
+
+
+@dataclasses.dataclass
+class Counters:
+    """How far a run has come; saved with each checkpoint.
+
+    Attributes:
+      num_steps: decisions of the agent so far.
+      num_episodes: whole episodes so far.
+      num_evals: evaluations so far.
+      last_eval_step: decision of the last evaluation.
+      last_checkpoint_step: decision of the last checkpoint.
+      seconds: wall-clock of the run, earlier processes included.
+    """
+
+    num_steps: int = 0
+    num_episodes: int = 0
+    num_evals: int = 0
+    last_eval_step: int = 0
+    last_checkpoint_step: int = 0
+    seconds: float = 0.0
+
+
+class Stopwatch:
+    """Adds up where the time goes."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {"environment": 0.0, "update": 0.0}
+        self.reward_seconds = 0.0
+
+    def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Returns `function`, its time added to `name`."""
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            start = time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self.seconds[name] += time.perf_counter() - start
+
+        return call
+
+
+class Run:
+    """One training run: its parts, its state, and what happens to them in order."""
+
+    def __init__(
+        self,
+        config: ml_collections.ConfigDict,
+        workdir: pathlib.Path,
+        demonstrations: host_demonstrations.Demonstrations | None,
+        say: Callable[[str], None],
+    ) -> None:
+        """Makes the parts and goes on from the newest checkpoint, if there is one."""
+        self.config = config
+        self.demonstrations = demonstrations
+        self.say = say
+        self.environment = experiment.training_environment(config)
+        self.eval_environment = experiment.evaluation_environment(config)
+        self.agent = experiment.make_agent(config, self.environment, demonstrations)
+        self.replay = experiment.make_replay(config, self.environment)
+        self.experts = experiment.expert_episodes(self.agent.rewarder, demonstrations)
+        self.counters = Counters()
+        self.checkpoints = Checkpoints(workdir, say=say)
+        self.stopwatch = Stopwatch()
+        self.metrics: dict[str, Any] = {}
+        self.decisions: list[Decision] = []
+        self.stop_asked = False
+        self.state: TrainState = self._restore_or_init()
+        self.exploration_key = jax.random.fold_in(
+            jax.random.key(config.seed), _EXPLORATION_KEY
+        )
+        self.started = time.monotonic() - self.counters.seconds
+        resumed = self.frame if self.counters.num_steps else None
+        self.outputs = outputs.Outputs(workdir, config, demonstrations, resumed)
+        self.progress = ProgressLine(config.total_frames, first_frame=self.frame)
+
+    @property
+    def frame(self) -> int:
+        """Environment frames so far."""
+        return self.counters.num_steps * self.config.action_repeat
+
+    def loop(self) -> None:
+        """Trains until the budget is used up, or until someone asks to stop."""
+        config, counters = self.config, self.counters
+        decisions = interact(
+            _TimedEnvironment(self.environment, self.stopwatch),
+            self.stopwatch.timed("update", self.act),
+            first_episode=counters.num_episodes,
+        )
+        while self.frame < config.total_frames and not self.stop_asked:
+            # Act and observe.
+            decision = next(decisions)
+            counters.num_steps += 1
+            self.decisions.append(decision)
+
+            # Learn.
+            if self.update_is_due():
+                self.stopwatch.timed("update", self.update)()
+
+            # Reward a finished episode, remember it, look at it.
+            if decision.is_last:
+                self.finish_episode()
+                if self.is_due(counters.last_eval_step, config.eval_every_frames):
+                    self.evaluate()
+                if self.is_due(
+                    counters.last_checkpoint_step, config.checkpoint_every_frames
+                ):
+                    self.save()
+            self.progress.update(self.frame, self.stopwatch.seconds)
+        self.finish()
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Returns an exploring action; uniform at first."""
+        num_steps = self.counters.num_steps
+        if num_steps < self.config.exploration_steps:
+            rng = self._rng(_UNIFORM_ACTIONS)
+            return rng.uniform(-1.0, 1.0, self.environment.action_spec().shape)
+        # The state is donated at each update: its parameters are read afresh.
+        encoder, actor, _ = self.state.params
+        return np.asarray(
+            self.agent.explore(
+                encoder,
+                actor,
+                observation,  # pyright: ignore[reportArgumentType]
+                self.exploration_key,
+                np.uint32(num_steps),  # pyright: ignore[reportArgumentType]
+            )
+        )
+
+    def update_is_due(self) -> bool:
+        """Says whether the learner steps after this decision."""
+        return (
+            self.frame >= self.config.seed_frames
+            and self.counters.num_steps % self.config.update_every_steps == 0
+            and self.replay.can_sample()
+        )
+
+    def update(self) -> None:
+        """Samples and learns once."""
+        rng = self._rng(_SAMPLED_BATCHES)
+        batch = Batch(*self.replay.sample(rng, self.config.batch_size))
+        expert = None
+        if self.agent.rewarder.samples_expert:
+            assert self.demonstrations is not None
+            expert = ExpertBatch(
+                *host_demonstrations.sample(
+                    self.demonstrations,
+                    rng,
+                    self.config.discriminator.batch_size,
+                    frame_stack=experiment.stack_size(self.config),
+                )
+            )
+        self.state, self.metrics = self.agent.update_step(self.state, batch, expert)
+
+    def finish_episode(self) -> None:
+        """Rewards a finished episode once, and stores it for good."""
+        episode = join(self.decisions)
+        self.decisions = []
+        start = time.perf_counter()
+        rewards = self.reward(episode)
+        self.stopwatch.reward_seconds += time.perf_counter() - start
+        self.stopwatch.seconds["update"] += time.perf_counter() - start
+        metrics = {name: float(value) for name, value in self.metrics.items()}
+        metrics |= {
+            name: float(value)
+            for name, value in self.agent.rewarder.summary(self.state.rewarder).items()
+        }
+        self.require_finite({**metrics, "imitation reward": float(np.sum(rewards))})
+        self.replay.add_episode(
+            frames=episode.frames,
+            actions=episode.actions,
+            rewards=rewards,
+            discounts=episode.discounts,
+        )
+        self.counters.seconds = time.monotonic() - self.started
+        self.outputs.episode(
+            frame=self.frame,
+            seconds=self.counters.seconds,
+            episode=self.counters.num_episodes,
+            task_return=float(np.sum(episode.task_rewards)),
+            imitation_return=float(np.sum(rewards)),
+            length=len(rewards),
+            reward_seconds=self.stopwatch.reward_seconds,
+            metrics=metrics,
+        )
+        self.counters.num_episodes += 1
+
+    def reward(self, episode: FinishedEpisode) -> np.ndarray:
+        """Returns the rewarder's rewards [T]; its state moves on."""
+        device_episode = Episode(
+            episode.frames,  # pyright: ignore[reportArgumentType]
+            episode.actions,  # pyright: ignore[reportArgumentType]
+            episode.task_rewards,  # pyright: ignore[reportArgumentType]
+        )
+        rewards, rewarder = self.agent.rewards(
+            self.state.rewarder, self.state.params, device_episode, self.experts
+        )
+        self.state = self.state.replace(rewarder=rewarder)
+        return np.asarray(rewards)
+
+    def require_finite(self, values: dict[str, float]) -> None:
+        """Raises TrainingDiverged where a number is not finite."""
+        bad = [name for name, value in values.items() if not np.isfinite(value)]
+        if bad:
+            good = self.checkpoints.newest()
+            where = "there is none" if good is None else f"that of frame {good}"
+            raise TrainingDiverged(
+                f"{', '.join(bad)} became infinite or NaN by frame {self.frame} (update "
+                f"{int(self.state.num_updates)}). Last good checkpoint: {where}. Lower "
+                "learning_rate, or look at train.csv for what grew before"
+            )
+
+    def evaluate(self) -> None:
+        """Plays evaluation episodes with the mean action and writes them down."""
+        config, counters = self.config, self.counters
+        encoder, actor, _ = self.state.params
+        every = config.video_every_evals
+        evaluation = evaluate(
+            self.eval_environment,
+            lambda o: np.asarray(self.agent.exploit(encoder, actor, o)),
+            num_episodes=config.num_eval_episodes,
+            first_episode=counters.num_evals * config.num_eval_episodes,
+            record_video=every > 0 and counters.num_evals % every == 0,
+        )
+        counters.num_evals += 1
+        counters.last_eval_step = counters.num_steps
+        counters.seconds = time.monotonic() - self.started
+        self.say(
+            self.outputs.evaluation(
+                evaluation, self.frame, counters.seconds, counters.num_episodes
+            )
+        )
+
+    def is_due(self, last_step: int, every_frames: int) -> bool:
+        """Says whether that many frames have gone by, or the budget is used up.
+
+        Tested at episode ends only, hence "at least": a modulo might never be zero.
+        """
+        passed = (self.counters.num_steps - last_step) * self.config.action_repeat
+        return passed >= every_frames or self.frame >= self.config.total_frames
+
+    def save(self) -> None:
+        """Writes a checkpoint: learner, counters, and the replay's new episodes."""
+        self.counters.last_checkpoint_step = self.counters.num_steps
+        self.counters.seconds = time.monotonic() - self.started
+        self.checkpoints.save(
+            frame=self.frame,
+            learner_state=self.state,
+            counters=dataclasses.asdict(self.counters),
+            replay=self.replay,
+        )
+
+    def finish(self) -> None:
+        """Saves what is not saved yet; an unfinished episode is dropped."""
+        self.progress.close()
+        if self.counters.last_checkpoint_step != self.counters.num_steps:
+            self.save()
+        self.outputs.close()
+
+    def _rng(self, stream: int) -> np.random.Generator:
+        return np.random.default_rng(
+            [self.config.seed, stream, self.counters.num_steps]
+        )
+
+    def _restore_or_init(self) -> TrainState:
+        if self.checkpoints.newest() is None:
+            return self.agent.init_state()
+        state, counters = self.checkpoints.restore(
+            experiment.abstract_state(self.agent), self.replay
+        )
+        self.counters = Counters(**counters)
+        self.say(f"going on from the checkpoint of frame {self.frame}")
+        return state
+
+
+class _TimedEnvironment:
+    """The environment, its time added up."""
+
+    def __init__(self, environment: Any, stopwatch: Stopwatch) -> None:
+        self.reset = stopwatch.timed("environment", environment.reset)
+        self.step = stopwatch.timed("environment", environment.step)
+        self.single_observation = environment.single_observation
+
+
+def train(config: ml_collections.ConfigDict, workdir: pathlib.Path) -> bool:
+    """Trains a run to its end, or on to its end.
+
+    Args:
+      config: checked.
+      workdir: the run's folder, opened by `workdir.opened`.
+
+    Returns:
+      Whether the budget is used up; False when someone asked to stop.
+
+    Raises:
+      DemonstrationError: the demonstrations can't serve this run.
+      TrainingDiverged: losses or rewards are not finite any more.
+    """
+    def say(text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+
+    demonstrations = experiment.load_demonstrations(config)
+    say(f"{config.task}: {METHODS[config.method]}, seed {config.seed}")
+    run = Run(config, workdir, demonstrations, say)
+    run.say = run.progress.message
+    with _stopping_on_signals(run):
+        run.loop()
+    if run.stop_asked:
+        say(f"stopped at frame {run.frame}, saved; the same command goes on from there")
+    return not run.stop_asked
+
+
+class _stopping_on_signals:
+    """Turns the first Ctrl-C or SIGTERM into a request, the second into an end."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+
+    def __enter__(self) -> None:
+        self._before = {
+            number: signal.signal(number, self._ask)
+            for number in (signal.SIGINT, signal.SIGTERM)
+        }
+
+    def __exit__(self, *_: Any) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _ask(self, number: int, frame: Any) -> None:
+        del frame
+        if self._run.stop_asked:
+            raise KeyboardInterrupt
+        self._run.stop_asked = True
+        name = "Ctrl-C" if number == signal.SIGINT else "SIGTERM"
+        self._run.progress.message(f"{name}: saving; once more ends at once, unsaved")
