@@ -11,7 +11,7 @@ runs at some 500 frames per second on one CPU core.
 from jaxil import config as jaxil_config
 
 # Frames until an expert is good enough to be imitated.
-_FRAMES = {"ball_in_cup_catch": 80_000, "cartpole_swingup": 60_000}
+_FRAMES = {"ball_in_cup_catch": 80_000, "cartpole_swingup": 100_000}
 
 
 def get_config(task: str = "cartpole_swingup"):

@@ -67,7 +67,8 @@ def examine(config: Any) -> Iterator[Finding]:
     for examination in examinations:
         try:
             yield from examination()
-        except Exception as error:  # a broken package must not hide the other findings
+        # A broken package may raise anything, and must not hide the other findings.
+        except Exception as error:
             where = traceback.extract_tb(error.__traceback__)[-1]
             place = f"{pathlib.Path(where.filename).name}, line {where.lineno}"
             yield Finding(
@@ -170,7 +171,7 @@ def memory(config: Any) -> Iterator[Finding]:
     if available is None:
         yield Finding("warning", "memory", "unknown here", "watch it yourself")
         return
-    if config is None:
+    if config is None or config.observation != "pixels":  # states take little
         yield Finding("ok", "memory", f"{available / 1e9:.1f} GB available")
         return
     from jaxil import config as jaxil_config
@@ -200,32 +201,34 @@ def demonstrations(config: Any) -> Iterator[Finding]:
         advice = "install the package again; its demonstrations folder is empty"
         yield Finding("fault", "demonstrations", "none are shipped", advice)
     for task in shipped:
-        yield _try_demonstrations(host.shipped_path(task), task, None)
+        yield _try_demonstrations(host.shipped_path(task), task)
     if config is None:
         return
     from jaxil import config as jaxil_config
 
-    if jaxil_config.uses_demonstrations(config):
-        source, number = (
-            config.demonstrations.source,
-            config.demonstrations.num_episodes,
+    if not jaxil_config.uses_demonstrations(config):
+        return
+    source = config.demonstrations.source
+    try:
+        host.check(
+            source,
+            task=config.task,
+            num_episodes=config.demonstrations.num_episodes,
+            action_repeat=config.action_repeat,
         )
-        try:
-            path = pathlib.Path(source) if source else host.shipped_path(config.task)
-        except host.DemonstrationError as error:
-            yield Finding("fault", "demonstrations", str(error))
-            return
-        yield _try_demonstrations(path, config.task, number)
+    except host.DemonstrationError as error:
+        yield Finding("fault", "demonstrations", str(error))
+        return
+    if source:
+        yield _try_demonstrations(pathlib.Path(source), config.task)
 
 
-def _try_demonstrations(
-    path: pathlib.Path, task: str, num_episodes: int | None
-) -> Finding:
+def _try_demonstrations(path: pathlib.Path, task: str) -> Finding:
     from jaxil.host import demonstrations as host
     from jaxil.host import rendering as drawing
 
     try:
-        stored = host.read_states(path, task=task, num_episodes=num_episodes)
+        stored = host.read_states(path, task=task)
         frames = drawing.observe_episodes(
             {
                 name: getattr(stored, name)[:1, :_NUM_TRIED_STATES]
@@ -286,7 +289,7 @@ def _read_config(argv: list[str]) -> Any:
     """Returns the checked config of the command line, the paper's where none is given.
 
     Raises:
-      UsageError, ConfigError: wrong use.
+      UsageError: wrong use.
     """
     from jaxil import command
     from jaxil import config as jaxil_config
@@ -299,8 +302,11 @@ def _read_config(argv: list[str]) -> Any:
             command.define_config(values)
 
     values = command.parse(argv, __doc__ or "", define)
-    config = values["config"].value if gives_config else jaxil_config.default_config()
-    jaxil_config.check(config, environments.known_tasks())
+    given: Any = values["config"].value if gives_config else None
+    config = jaxil_config.default_config() if given is None else given
+    faults = jaxil_config.problems(config, environments.known_tasks())
+    if faults:
+        raise command.UsageError(command.listing(faults))
     return config
 
 

@@ -88,15 +88,18 @@ def renderer_name(config: ml_collections.ConfigDict) -> str:
 
 def training_environment(config: ml_collections.ConfigDict) -> PixelEnvironment:
     """Returns the environment that gathers experience."""
-    return _environment(config, config.seed)
+    return environment_with_seed(config, config.seed)
 
 
 def evaluation_environment(config: ml_collections.ConfigDict) -> PixelEnvironment:
     """Returns an environment of its own, with starts of its own."""
-    return _environment(config, config.seed + _EVALUATION_SEED)
+    return environment_with_seed(config, config.seed + _EVALUATION_SEED)
 
 
-def _environment(config: ml_collections.ConfigDict, seed: int) -> PixelEnvironment:
+def environment_with_seed(
+    config: ml_collections.ConfigDict, seed: int
+) -> PixelEnvironment:
+    """Returns the run's environment with another seed for its resets."""
     return make_environment(
         config.task,
         seed=seed,

@@ -33,7 +33,8 @@ with context.make_current() as current:
     current.call(lambda: None)
 os._exit(0)
 """
-_GL_PROBE_SECONDS = 30.0
+_GL_PROBE_SECONDS = 15.0
+_GL_PROBE_TRIES = 2  # drivers have been seen to hang, once in hundreds of tries
 
 
 def prepare() -> str:
@@ -58,6 +59,7 @@ def prepare() -> str:
         # Without these, what compiles in under a second is compiled every time.
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+        _tell_imported_jax()
     parts.append(f"XLA_FLAGS={os.environ.get('XLA_FLAGS', '')!r}")
     return ", ".join(parts)
 
@@ -86,18 +88,20 @@ def gl_works(backend: str) -> bool:
     """Returns whether `backend` ("egl", "osmesa") can make a context here."""
     environment = {**os.environ, "MUJOCO_GL": backend}
     environment.pop("PYOPENGL_PLATFORM", None)
-    try:
-        probe = subprocess.run(
-            [sys.executable, "-c", _GL_PROBE],
-            check=False,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            timeout=_GL_PROBE_SECONDS,
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return False
-    return probe.returncode == 0
+    for _ in range(_GL_PROBE_TRIES):
+        try:
+            probe = subprocess.run(
+                [sys.executable, "-c", _GL_PROBE],
+                check=False,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                timeout=_GL_PROBE_SECONDS,
+            )
+        except subprocess.TimeoutExpired:
+            continue
+        return probe.returncode == 0
+    return False
 
 
 def available_memory_bytes(root: pathlib.Path = pathlib.Path("/")) -> int | None:
@@ -174,6 +178,19 @@ def _choose_gl() -> str:
     # Left unset, dm_control would try a window, and die with an unclear message.
     os.environ["MUJOCO_GL"] = "disable"
     return f"no GL: `apt-get install {' '.join(GL_PACKAGES)}` brings one"
+
+
+def _tell_imported_jax() -> None:
+    """Hands the cache's settings to jax where it was imported before they were made."""
+    jax = sys.modules.get("jax")
+    if jax is None:
+        return
+    for name, kind in (
+        ("jax_compilation_cache_dir", str),
+        ("jax_persistent_cache_min_compile_time_secs", float),
+        ("jax_persistent_cache_min_entry_size_bytes", int),
+    ):
+        jax.config.update(name, kind(os.environ[name.upper()]))
 
 
 def _compilation_folder() -> pathlib.Path:

@@ -113,7 +113,10 @@ class Run:
         return self.counters.num_steps * self.config.action_repeat
 
     def loop(self) -> None:
-        """Trains until the budget is used up, or until someone asks to stop."""
+        """Trains until the budget is used up, or until someone asks to stop.
+
+        `finish` has to follow.
+        """
         config, counters = self.config, self.counters
         decisions = interact(
             _TimedEnvironment(self.environment, self.stopwatch),
@@ -140,7 +143,6 @@ class Run:
                 ):
                     self.save()
             self.progress.update(self.frame, self.stopwatch.seconds)
-        self.finish()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Returns an exploring action; uniform at first."""
@@ -338,6 +340,7 @@ def train(config: ml_collections.ConfigDict, workdir: pathlib.Path) -> bool:
     run.say = run.progress.message
     with _stopping_on_signals(run):
         run.loop()
+        run.finish()
     if run.stop_asked:
         say(f"stopped at frame {run.frame}, saved; the same command goes on from there")
     return not run.stop_asked

@@ -3,9 +3,9 @@
     DIR/checkpoints/frame_000000010000/   arrays, counters, and which episodes they need
     DIR/replay/episode_00000012.npz       written once, never changed
 
-Episode files are written first and the checkpoint is renamed into place after them; old
-ones are deleted last. So at any kill the newest checkpoint in place is whole, and so are
-all the episodes that it needs.
+Episode files are written first, then the checkpoint is renamed into place, and old ones
+are deleted last. So at any kill the newest checkpoint in place is whole, and so are all
+the episodes that it needs.
 """
 
 import json
@@ -29,7 +29,7 @@ from jaxil.host.replay import Episode, Replay
 _NUM_KEPT = 2  # the newest, and the one to fall back to
 _FORMAT = 1
 _CHECKSUMS = "checksums.json"
-# The second number tells two checkpoints of one frame apart (Ctrl-C right after a save).
+# The second number tells two checkpoints of one frame apart (Ctrl-C after a save).
 _CHECKPOINT = re.compile(r"frame_(\d{12,})(?:_(\d+))?")
 _EPISODE = re.compile(r"episode_(\d{8,})\.npz")
 _UNFINISHED = re.compile(r"\.(saving|deleting|writing)_.*")
@@ -56,7 +56,7 @@ class Checkpoints:
 
         Args:
           workdir: the run's folder.
-          say: takes one line for people, e.g. on a damaged checkpoint; stderr when None.
+          say: takes a line for people, e.g. on a damaged checkpoint; None: stderr.
         """
         # orbax wants absolute paths.
         self._checkpoints = pathlib.Path(workdir).absolute() / "checkpoints"
@@ -67,7 +67,7 @@ class Checkpoints:
         self._oldest_episode: dict[pathlib.Path, int] = {}  # that a checkpoint needs
 
     def newest(self) -> int | None:
-        """Returns the environment frame of the newest checkpoint, None if there is none."""
+        """Returns the environment frame of the newest checkpoint, or None."""
         paths = self._committed()
         return _order(paths[-1])[0] if paths else None
 
@@ -337,7 +337,7 @@ def _write_episode(path: pathlib.Path, episode: Episode) -> None:
     temporary = path.with_name(f".writing_{uuid.uuid4().hex}.npz")
     try:
         with temporary.open("wb") as file:
-            # np.savez_compressed packs at level 6: several times slower, little smaller.
+            # np.savez_compressed packs at level 6: slower by far, little smaller.
             with zipfile.ZipFile(
                 file, "w", zipfile.ZIP_DEFLATED, compresslevel=1
             ) as archive:

@@ -10,6 +10,7 @@ Pixels are not stored: they would be a thousand times larger, and would not matc
 renderer of another machine. Baselines alone may look at actions and rewards.
 """
 
+import functools
 import importlib.metadata
 import json
 import logging
@@ -226,9 +227,7 @@ def check(
     Raises:
       DemonstrationError: as `load`.
     """
-    path = pathlib.Path(source) if str(source) else shipped_path(task)
-    states = read_states(path, task=task, num_episodes=num_episodes)
-    _stride(path, states.metadata["action_repeat"], action_repeat)
+    _open(source, task=task, num_episodes=num_episodes, action_repeat=action_repeat)
 
 
 def load(
@@ -260,16 +259,10 @@ def load(
     Raises:
       DemonstrationError: see `read_states`; or the action repeats don't fit.
     """
-    path = pathlib.Path(source) if str(source) else shipped_path(task)
-    states = read_states(path, task=task, num_episodes=num_episodes)
-    stride = _stride(path, states.metadata["action_repeat"], action_repeat)
+    path, states, stride = _open(
+        source, task=task, num_episodes=num_episodes, action_repeat=action_repeat
+    )
     num_steps = states.rewards.shape[1] // stride
-    if num_steps < 1:
-        raise _fault(
-            path,
-            f"has episodes shorter than one step of action_repeat={action_repeat}",
-            "Choose a smaller action_repeat",
-        )
     _warn_of_versions(path, states.metadata["versions"])
     steps = slice(0, num_steps * stride + 1, stride)
     try:
@@ -298,6 +291,36 @@ def load(
     return Demonstrations(frames, actions, task_rewards, metadata)
 
 
+def sample(
+    demonstrations: Demonstrations,
+    rng: np.random.Generator,
+    batch_size: int,
+    *,
+    frame_stack: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draws expert observations with the actions taken there, uniformly.
+
+    Args:
+      demonstrations: whole episodes of single frames.
+      rng: source of the draw.
+      batch_size: B.
+      frame_stack: frames in an observation; an episode's first frame stands in for
+        those before it.
+
+    Returns:
+      Observations uint8 [B, H, W, 3 * frame_stack] or float32 [B, S], and actions
+      [B, A].
+    """
+    num_episodes, num_steps = demonstrations.actions.shape[:2]
+    episodes = rng.integers(num_episodes, size=batch_size)
+    steps = rng.integers(num_steps, size=batch_size)
+    stack = [
+        demonstrations.frames[episodes, np.maximum(steps - age, 0)]
+        for age in range(frame_stack - 1, -1, -1)
+    ]
+    return np.concatenate(stack, axis=-1), demonstrations.actions[episodes, steps]
+
+
 def _shipped_folder() -> pathlib.Path:
     return pathlib.Path(__file__).parent.parent / "demonstrations"
 
@@ -320,8 +343,8 @@ def _metadata_fault(metadata: Any) -> str | None:
         return "is not a file of demonstrations: its metadata lack the format's name"
     if metadata.get("version") != VERSION:
         return (
-            f"has version {metadata.get('version')!r} of the format, where this program "
-            f"reads version {VERSION}"
+            f"has version {metadata.get('version')!r} of the format, where this "
+            f"program reads version {VERSION}"
         )
     for name, kind in _METADATA.items():
         value = metadata.get(name)
@@ -364,15 +387,44 @@ def _array_fault(demonstrations: StateDemonstrations) -> str | None:
     return None
 
 
-def _stride(path: pathlib.Path, recorded: int, wanted: int) -> int:
-    if wanted < 1 or wanted % recorded:
+def _open(
+    source: str | os.PathLike, *, task: str, num_episodes: int, action_repeat: int
+) -> tuple[pathlib.Path, StateDemonstrations, int]:
+    """Returns path, contents, and how many stored steps make one of the agent's."""
+    path = pathlib.Path(source) if str(source) else shipped_path(task)
+    states = read_states(path, task=task, num_episodes=num_episodes)
+    recorded = states.metadata["action_repeat"]
+    if action_repeat < 1 or action_repeat % recorded:
         raise _fault(
             path,
             f"was recorded with action_repeat={recorded}, which cannot serve "
-            f"action_repeat={wanted}",
+            f"action_repeat={action_repeat}",
             f"Take a multiple of {recorded}, or record it again",
         )
-    return wanted // recorded
+    stride = action_repeat // recorded
+    if stride > states.rewards.shape[1]:
+        raise _fault(
+            path,
+            f"has episodes shorter than one step of action_repeat={action_repeat}",
+            "Choose a smaller action_repeat",
+        )
+    for name, size in _model_sizes(task).items():
+        stored = getattr(states, name).shape[2]
+        if stored != size:
+            raise _fault(
+                path, f"has {name} of {stored} numbers, where {task} needs {size}"
+            )
+    return path, states, stride
+
+
+@functools.cache
+def _model_sizes(task: str) -> dict[str, int]:
+    """Returns the lengths of qpos, qvel, act and an action."""
+    with environments.make_environment(
+        task, seed=0, observation="state"
+    ) as environment:
+        sizes = {name: len(x) for name, x in environment.simulator_state().items()}
+        return {**sizes, "actions": environment.action_spec().shape[0]}
 
 
 def _warn_of_versions(path: pathlib.Path, recorded: dict[str, str]) -> None:
@@ -389,33 +441,3 @@ def _warn_of_versions(path: pathlib.Path, recorded: dict[str, str]) -> None:
             path,
             ", ".join(differing),
         )
-
-
-def sample(
-    demonstrations: Demonstrations,
-    rng: np.random.Generator,
-    batch_size: int,
-    *,
-    frame_stack: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draws expert observations with the actions taken there, uniformly.
-
-    Args:
-      demonstrations: whole episodes of single frames.
-      rng: source of the draw.
-      batch_size: B.
-      frame_stack: frames in an observation; an episode's first frame stands in for
-        those before it.
-
-    Returns:
-      Observations uint8 [B, H, W, 3 * frame_stack] or float32 [B, S], and actions
-      [B, A].
-    """
-    num_episodes, num_steps = demonstrations.actions.shape[:2]
-    episodes = rng.integers(num_episodes, size=batch_size)
-    steps = rng.integers(num_steps, size=batch_size)
-    stack = [
-        demonstrations.frames[episodes, np.maximum(steps - age, 0)]
-        for age in range(frame_stack - 1, -1, -1)
-    ]
-    return np.concatenate(stack, axis=-1), demonstrations.actions[episodes, steps]

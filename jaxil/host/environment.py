@@ -329,7 +329,8 @@ class PixelEnvironment(dm_env.Environment):
             shape = getattr(data, name).shape
             if np.shape(value) != shape:
                 raise ValueError(
-                    f"{name} has shape {np.shape(value)}, but {self._name} needs {shape}."
+                    f"{name} has shape {np.shape(value)}, but {self._name} "
+                    f"needs {shape}."
                 )
         with self.physics.reset_context():
             for name, value in values.items():

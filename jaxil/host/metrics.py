@@ -240,8 +240,8 @@ def write_learning_curve(
     else:
         axes.text(0.5, 0.5, "no evaluation yet", ha="center", transform=axes.transAxes)
     top = np.max([1.0, *(mean + spread), expert_return or 0.0], initial=1.0)
-    axes.set_ylim(min(0.0, float(np.min(mean - spread, initial=0.0))), 1.08 * top)
-    axes.set_xlim(0, max(float(np.max(frames, initial=0.0)), 1.0))
+    axes.set_ylim(min(-0.01 * top, float(np.min(mean, initial=0.0))), 1.05 * top)
+    axes.set_xlim(0, 1.02 * float(np.max(frames, initial=1000.0)))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.set_xlabel("environment frames")
     axes.set_ylabel("task return")
@@ -249,7 +249,8 @@ def write_learning_curve(
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="y", alpha=0.25, lw=0.6)
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="lower right", frameon=False, fontsize=8.5)
+        # Below the axes, where no curve can run through it.
+        figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8.5)
     picture = io.BytesIO()
     figure.savefig(picture, format="png")
     write_atomically(path, picture.getvalue())

@@ -10,10 +10,10 @@ _PLAIN_SECONDS = 30.0  # between two lines in a log file
 
 
 class ProgressLine:
-    """Writes one line on stderr, over and over: redrawn in a terminal, else now and then.
+    """Writes one line on stderr: redrawn in a terminal, else a new one now and then.
 
-    Frames per second and the split are those of the time since the line was last reset
-    (every `window_seconds`), so they follow a run that changes speed.
+    Frames per second and the split are those of the last half to whole window, so they
+    follow a run that changes speed.
     """
 
     def __init__(
@@ -31,7 +31,7 @@ class ProgressLine:
           total_frames: environment frames at the run's end, >= 1.
           first_frame: frame at which this process starts (not 0 after a resume).
           stream: where to write; stderr when None.
-          window_seconds: length of time that speed and split are taken over.
+          window_seconds: longest time that speed and split are taken over.
           clock: seconds from any origin, for tests.
         """
         self._total_frames = total_frames
@@ -40,7 +40,7 @@ class ProgressLine:
         self._clock = clock
         self._window_seconds = window_seconds
         now = clock()
-        # Two marks: while the newer one fills its window, the older one is measured from.
+        # Two marks half a window apart: speed is measured from the older one.
         self._marks = [(now, first_frame, {})] * 2
         self._next_write = now if self._live else now + _PLAIN_SECONDS / 10
         self._width = 0

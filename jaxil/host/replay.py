@@ -69,8 +69,8 @@ def _num_slots(capacity_steps: int, episode_steps: int) -> int:
 class Replay:
     """Stores the newest episodes and samples n-step transitions from them, uniformly.
 
-    The next free slot follows the newest frame, modulo the ring's length; an episode may
-    run over the ring's end. A slot holds o_t with a_t, r_t and the discount that follow.
+    The next free slot follows the newest frame, modulo the ring's length; an episode
+    may run over the ring's end. A slot holds o_t with the a_t, r_t and d_t that follow.
     """
 
     def __init__(
@@ -241,8 +241,9 @@ class Replay:
         """Draws transitions, uniformly with replacement from all windows of n steps.
 
         reward = sum_{k<n} gamma^k d_t ... d_{t+k-1} r_{t+k}, and
-        discount = gamma^n d_t ... d_{t+n-1}, with d the environment's discounts. Windows
-        stay within their episode, and so do stacks: frame 0 is repeated at its start.
+        discount = gamma^n d_t ... d_{t+n-1}, with d the environment's discounts.
+        Windows stay within their episode, and so do stacks: frame 0 is repeated at its
+        start.
 
         Args:
           rng: source of the draw; it is advanced by one call.
@@ -256,8 +257,8 @@ class Replay:
         """
         if not self.can_sample():
             raise ValueError(
-                f"num_steps_stored = {self._num_steps_stored}: expected an episode of at"
-                f" least {self._window} steps; add one before sampling"
+                f"num_steps_stored = {self._num_steps_stored}: expected an episode of"
+                f" at least {self._window} steps; add one before sampling"
             )
         flat = rng.integers(self._num_starts, size=batch_size)
         which = np.searchsorted(self._last_starts, flat, side="right")
@@ -311,7 +312,8 @@ class Replay:
                 return False, f"episode {number} has {stored.num_steps} steps"
             if stored.start != expected:
                 return False, (
-                    f"episode {number} starts in slot {stored.start}: expected {expected}"
+                    f"episode {number} starts in slot {stored.start}:"
+                    f" expected {expected}"
                 )
             expected = (expected + stored.num_steps + 1) % num_slots
         windows = sum(max(s.num_steps - self._window + 1, 0) for s in self._stored)
@@ -351,7 +353,7 @@ class Replay:
         return Episode(*arrays)
 
     def _index_starts(self) -> None:
-        """Lays the valid starts of all episodes end to end, so that one draw picks one."""
+        """Lays the starts of all windows end to end, so that one draw picks one."""
         lengths = np.array([stored.num_steps for stored in self._stored], np.int64)
         counts = np.maximum(lengths - self._window + 1, 0)
         self._last_starts = np.cumsum(counts)  # exclusive end of each episode's starts

@@ -1,8 +1,11 @@
 """Videos of an episode, the agent beside the expert."""
 
+import contextlib
 import os
 import pathlib
+import subprocess
 import uuid
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -28,7 +31,7 @@ def write_video(
       path: the file, ending in .mp4; it is replaced as a whole.
       frames_left: [T, H, W, 3] uint8, T >= 1.
       frames_right: [T', H, W, 3] uint8 of the same size, or None.
-      fps: frames per second of the video, > 0, rounded to a whole number.
+      fps: frames per second of the video, > 0.
       labels: captions of the left and right picture.
 
     Raises:
@@ -49,33 +52,58 @@ def write_video(
     if not fps > 0:
         raise ValueError(f"fps = {fps}: expected > 0")
 
-    import imageio_ffmpeg  # starts a search for the ffmpeg binary
-
     canvas, corners, factor = _canvas(frames_left.shape[1:3], labels[: len(sides)])
-    path = pathlib.Path(path)
-    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp.mp4")
-    height, width = canvas.shape[:2]
-    writer = imageio_ffmpeg.write_frames(
-        str(temporary),
-        (width, height),
-        fps=max(1, round(fps)),
-        quality=8,
-        macro_block_size=2,  # H.264 with 4:2:0 colours wants even sizes, no more
-        ffmpeg_log_level="error",
-    )
-    try:
-        writer.send(None)
+
+    def pictures() -> Iterator[np.ndarray]:
         for step in range(max(map(len, sides))):
             for frames, (row, column) in zip(sides, corners, strict=True):
                 frame = frames[min(step, len(frames) - 1)]
                 big = frame.repeat(factor, axis=0).repeat(factor, axis=1)
                 canvas[row : row + big.shape[0], column : column + big.shape[1]] = big
-            writer.send(np.ascontiguousarray(canvas))
-        writer.close()
+            yield canvas
+
+    path = pathlib.Path(path)
+    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp.mp4")
+    try:
+        _encode(temporary, pictures(), size=canvas.shape[:2], fps=fps)
         os.replace(temporary, path)
     finally:
-        writer.close()
         temporary.unlink(missing_ok=True)
+
+
+def _encode(
+    path: pathlib.Path,
+    pictures: Iterator[np.ndarray],
+    *,
+    size: tuple[int, int],
+    fps: float,
+) -> None:
+    """Pipes pictures [H, W, 3] through ffmpeg into an H.264 file."""
+    import imageio_ffmpeg
+
+    # Its own write_frames runs Python code between fork and exec, which can deadlock a
+    # process that has threads, as one with jax has; a process group does the same: an
+    # interrupt (Ctrl-C) reaches us and not ffmpeg.
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y"]
+    command += ["-f", "rawvideo", "-pix_fmt", "rgb24"]
+    command += ["-s", f"{size[1]}x{size[0]}", "-r", str(fps), "-i", "-"]
+    # Every player understands 4:2:0 colours, which want even sizes.
+    command += ["-c:v", "libx264", "-preset", "veryfast", "-crf", "18"]
+    command += ["-pix_fmt", "yuv420p", "-movflags", "+faststart", str(path)]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, process_group=0
+    ) as process:
+        assert process.stdin is not None
+        assert process.stderr is not None
+        # A broken pipe: ffmpeg has given up, and says why.
+        with contextlib.suppress(BrokenPipeError):
+            for picture in pictures:
+                process.stdin.write(picture.tobytes())
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.close()
+        said = process.stderr.read().decode(errors="replace").strip()
+    if process.returncode != 0:
+        raise OSError(f"{path.name}: ffmpeg could not write the video: {said}")
 
 
 def _canvas(

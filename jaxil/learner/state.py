@@ -62,9 +62,7 @@ class TrainState:
     @property
     def params(self) -> LearnerParams:
         """The live parameters, for policies and rewarders."""
-        return LearnerParams(
-            self.encoder.params, self.actor.params, self.critic.params
-        )
+        return LearnerParams(self.encoder.params, self.actor.params, self.critic.params)
 
 
 def init_module(params: Params, optimiser: optax.GradientTransformation) -> ModuleState:

@@ -54,8 +54,9 @@ def random_shift(images: Array, key: Array, *, padding: int) -> Array:
     batch, height, width, _ = images.shape
     corners = jax.random.randint(key, (batch, 2), 0, 2 * padding + 1)
     # Clipped source indices are edge padding without the padded copy.
-    rows = jnp.clip(jnp.arange(height) + corners[:, :1] - padding, 0, height - 1)
-    columns = jnp.clip(jnp.arange(width) + corners[:, 1:] - padding, 0, width - 1)
+    shifts = corners - padding
+    rows = jnp.clip(jnp.arange(height)[None] + shifts[:, :1], 0, height - 1)
+    columns = jnp.clip(jnp.arange(width)[None] + shifts[:, 1:], 0, width - 1)
 
     def shift(image: Array, row: Array, column: Array) -> Array:
         return jnp.take(jnp.take(image, row, axis=0), column, axis=1)

@@ -38,7 +38,8 @@ class PixelEncoder(nn.Module):
         """Maps uint8 [B, H, W, C] to float32 [B, R]."""
         chex.assert_rank(observation, 4)
         x = observation.astype(jnp.float32) / 255.0
-        x = self.contrast * (x - jnp.asarray(self.mean, jnp.float32))
+        mean = jnp.asarray(self.mean, jnp.float32)
+        x = self.contrast * (x - (mean[None] if mean.ndim else mean))
         layers = zip(self.channels, self.kernel_sizes, self.strides, strict=True)
         for features, size, stride in layers:
             x = nn.Conv(

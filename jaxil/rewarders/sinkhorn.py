@@ -106,7 +106,11 @@ def make_sinkhorn_rewarder(
         expert_episodes: ExpertEpisodes | None,
     ) -> tuple[Array, SinkhornState]:
         assert expert_episodes is not None
-        chex.assert_equal_shape_prefix([expert_episodes.frames, expert_episodes.actions], 1)
+        chex.assert_equal_shape_prefix(
+            [expert_episodes.frames, expert_episodes.actions], 1
+        )
+        num_steps = jnp.asarray(episode.actions.shape[0], jnp.int32)
+        state = state.replace(steps_since_copy=state.steps_since_copy + num_steps)
         state = jax.lax.cond(
             state.steps_since_copy >= target_update_steps,
             lambda old: copy_targets(old, learner, expert_episodes),
@@ -122,10 +126,7 @@ def make_sinkhorn_rewarder(
         )[1:]
         first_scale = return_scale / jnp.maximum(-jnp.sum(unscaled), _COST_FLOOR)
         scale = jnp.where(state.scale > 0.0, state.scale, first_scale)
-        num_steps = jnp.asarray(episode.actions.shape[0], jnp.int32)
-        return scale * unscaled, state.replace(
-            scale=scale, steps_since_copy=state.steps_since_copy + num_steps
-        )
+        return scale * unscaled, state.replace(scale=scale)
 
     return Rewarder(
         init,

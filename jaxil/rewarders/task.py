@@ -20,7 +20,9 @@ def make_task_rewarder() -> Rewarder:
         del learner, expert_episodes
         return episode.task_rewards, state
 
-    return Rewarder(_no_state, keep_state, rewards, samples_expert=False, matches_episodes=False)
+    return Rewarder(
+        _no_state, keep_state, rewards, samples_expert=False, matches_episodes=False
+    )
 
 
 def make_zero_rewarder() -> Rewarder:
@@ -35,7 +37,9 @@ def make_zero_rewarder() -> Rewarder:
         del learner, expert_episodes
         return jnp.zeros_like(episode.task_rewards), state
 
-    return Rewarder(_no_state, keep_state, rewards, samples_expert=False, matches_episodes=False)
+    return Rewarder(
+        _no_state, keep_state, rewards, samples_expert=False, matches_episodes=False
+    )
 
 
 def _no_state(key: Array, spec: Spec, learner: LearnerParams) -> tuple[()]:

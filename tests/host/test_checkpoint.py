@@ -89,7 +89,7 @@ def save(checkpoints, frame: int, replay: Replay, **counters) -> None:
 def flip_a_bit(workdir, name: str, seed: int) -> None:
     """Damages one file of a checkpoint."""
     rng = random.Random(seed)
-    paths = [path for path in (workdir / "checkpoints" / name).rglob("*")]
+    paths = (workdir / "checkpoints" / name).rglob("*")
     path = rng.choice(sorted(p for p in paths if p.is_file() and p.stat().st_size))
     content = bytearray(path.read_bytes())
     content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
@@ -150,7 +150,8 @@ def test_episodes_are_written_once_and_go_after_the_checkpoints_that_need_them(
     save(checkpoints, 2, replay)
     after = episode_files(tmp_path)
 
-    assert list(before) and set(after) == {f"episode_{i:08d}.npz" for i in range(4)}
+    assert len(before) == 2
+    assert set(after) == {f"episode_{i:08d}.npz" for i in range(4)}
     assert {name: after[name] for name in before} == before
 
     add_episodes(replay, 1)
@@ -341,7 +342,9 @@ def test_when_all_are_damaged(tmp_path):
     for name in ("frame_000000000001", "frame_000000000002"):
         flip_a_bit(tmp_path, name, 0)
 
-    with pytest.raises(CheckpointError, match="frame 2 is damaged.*frame 1 is damaged"):
+    with pytest.raises(
+        CheckpointError, match=r"frame 2 is damaged.*frame 1 is damaged"
+    ):
         Checkpoints(tmp_path).restore(ABSTRACT, replay)
 
 

@@ -96,7 +96,9 @@ def test_wrong_columns_are_named(tmp_path):
     with pytest.raises(ValueError, match='expected "frame"'):
         CsvLog(tmp_path / "log.csv", ("episode",))
     log = CsvLog(tmp_path / "log.csv", COLUMNS)
-    with pytest.raises(ValueError, match="log.csv has no column losss: expected frame"):
+    with pytest.raises(
+        ValueError, match=r"log\.csv has no column losss: expected frame"
+    ):
         log.append({"frame": 1, "losss": 2})
     log.close()
     assert (tmp_path / "log.csv").read_text() == "frame,episode,task_return\n"
@@ -107,7 +109,7 @@ def test_a_file_that_is_no_table_is_refused(tmp_path, text):
     path = tmp_path / "log.csv"
     path.write_text(text)
 
-    with pytest.raises(ValueError, match="log.csv: expected"):
+    with pytest.raises(ValueError, match=r"log\.csv: expected"):
         read_csv(path)
 
 
@@ -196,7 +198,7 @@ def test_the_live_line_by_hand():
         note="checkpoint at 500",
     )
 
-    # 1000 frames in 10 s; 2, 7.5 and 0.5 of the 10 seconds; 9000 frames at 100 a second.
+    # 1000 frames in 10 s; 2, 7.5 and 0.5 s of the 10; 9000 frames left at 100 a second.
     assert stream.getvalue() == (
         "\r1000/10000 frames (10.0 %) | 100 frames/s"
         " | environment 20% update 75% rest 5% | return task 12.3"

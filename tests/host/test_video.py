@@ -90,3 +90,10 @@ def test_bad_frames_are_refused(tmp_path, left, right, fps, message):
         write_video(tmp_path / "video.mp4", left, right, fps=fps)
 
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failing_encoder_is_told(tmp_path):
+    with pytest.raises(OSError, match="ffmpeg could not write the video"):
+        write_video(
+            tmp_path / "missing" / "video.mp4", plain_frames(40, (0, 0, 0)), fps=10
+        )

@@ -1,0 +1,84 @@
+r"""Evaluates the newest checkpoint of a run again: returns, and a video.
+
+    python -m jaxil.evaluate --workdir=runs/pdac --num_episodes=50
+
+The policy acts by its mean action, on the task's own reward. Nothing of the run is
+changed; the video goes to WORKDIR/videos/evaluation.mp4, the returns to the screen.
+"""
+
+import pathlib
+import sys
+
+from absl import flags
+
+from jaxil import command
+
+# Far from the episodes that training evaluates on.
+_FIRST_EPISODE = 1_000_000
+
+
+def main(argv: list[str]) -> None:
+    """Runs the command."""
+    values = command.parse(argv, __doc__ or "", _define)
+    if values.workdir is None:
+        raise command.UsageError(
+            "--workdir is missing: name the folder of a run, such as --workdir=runs/1"
+        )
+    from jaxil import platform
+
+    print(platform.prepare(), file=sys.stderr, flush=True)
+    import numpy as np
+
+    from jaxil import outputs, trained
+    from jaxil.host.evaluation import evaluate
+    from jaxil.host.video import write_video
+
+    folder = pathlib.Path(values.workdir)
+    run = trained.load(folder)
+    evaluation = evaluate(
+        run.environment,
+        run.act,
+        num_episodes=values.num_episodes,
+        first_episode=_FIRST_EPISODE,
+        record_video=True,
+    )
+    for number, task_return in enumerate(evaluation.task_returns):
+        print(f"episode {number}: {task_return:.1f}")
+    line = (
+        f"{run.config.method} on {run.config.task}, frame {run.frame}: mean "
+        f"{evaluation.mean:.1f}, std {evaluation.std:.1f}, minimum "
+        f"{np.min(evaluation.task_returns):.1f}, maximum "
+        f"{np.max(evaluation.task_returns):.1f}"
+    )
+    expert_frames = None
+    if run.demonstrations is not None:
+        line += f"; the expert's mean {np.mean(run.demonstrations.metadata['returns']):.1f}"
+        if run.demonstrations.frames.ndim == 5:
+            expert_frames = run.demonstrations.frames[0]
+    print(line)
+    assert evaluation.video is not None
+    (folder / "videos").mkdir(exist_ok=True)
+    path = folder / "videos" / "evaluation.mp4"
+    write_video(
+        path,
+        evaluation.video,
+        expert_frames,
+        fps=outputs.frames_per_second(len(evaluation.video)),
+    )
+    print(f"video: {path}")
+
+
+def _define(values: flags.FlagValues) -> None:
+    flags.DEFINE_string("workdir", None, "folder of the run", flag_values=values)
+    flags.DEFINE_integer(
+        "num_episodes",
+        10,
+        "episodes to play",
+        lower_bound=1,
+        upper_bound=100_000,
+        flag_values=values,
+    )
+
+
+if __name__ == "__main__":
+    command.run(main)

@@ -1,0 +1,58 @@
+"""Plays a trained policy and keeps the simulator's states."""
+
+from typing import Any
+
+import numpy as np
+
+from jaxil import experiment
+from jaxil.host import demonstrations
+from jaxil.trained import Trained
+
+_STATE_NAMES = ("qpos", "qvel", "act")
+
+
+def record(
+    run: Trained, *, num_episodes: int, seed: int
+) -> demonstrations.StateDemonstrations:
+    """Returns deterministic episodes of a policy, from different resets.
+
+    Args:
+      run: the policy; its own environment is not touched.
+      num_episodes: K.
+      seed: of the resets.
+    """
+    environment = experiment.environment_with_seed(run.config, seed)
+    states: dict[str, list[Any]] = {name: [] for name in _STATE_NAMES}
+    all_actions, all_rewards = [], []
+    for episode in range(num_episodes):
+        timestep = environment.reset(episode=episode)
+        visited, actions, rewards = [environment.simulator_state()], [], []
+        while not timestep.last():
+            action = run.act(timestep.observation)
+            timestep = environment.step(action)
+            visited.append(environment.simulator_state())
+            actions.append(action)
+            rewards.append(timestep.reward)
+        for name in _STATE_NAMES:
+            states[name].append(np.stack([state[name] for state in visited]))
+        all_actions.append(np.stack(actions))
+        all_rewards.append(rewards)
+    rewards = np.asarray(all_rewards, np.float32)
+    config = run.config
+    return demonstrations.StateDemonstrations(
+        **{name: np.stack(episodes) for name, episodes in states.items()},
+        actions=np.stack(all_actions).astype(np.float32),
+        rewards=rewards,
+        metadata=demonstrations.new_metadata(
+            task=config.task,
+            action_repeat=config.action_repeat,
+            seed=seed,
+            first_episode=0,
+            expert=(
+                f"{config.method} learner on {config.observation}, seed {config.seed}, "
+                f"{run.frame} frames, {run.seconds / 60:.0f} minutes of training; mean "
+                "action, no noise"
+            ),
+            rewards=rewards,
+        ),
+    )

@@ -1,0 +1,72 @@
+"""A policy that a run has learned, taken from its newest checkpoint."""
+
+import pathlib
+from collections.abc import Callable
+from typing import NamedTuple
+
+import ml_collections
+import numpy as np
+
+from jaxil import experiment, workdir
+from jaxil.command import UsageError
+from jaxil.host import demonstrations as host_demonstrations
+from jaxil.host.checkpoint import CheckpointError, Checkpoints
+from jaxil.host.environment import PixelEnvironment
+
+
+class Trained(NamedTuple):
+    """What it takes to play a learned policy.
+
+    Attributes:
+      config: the run's settings.
+      environment: one of its own, apart from the training's.
+      act: observation -> mean action.
+      demonstrations: what the run imitates; None without.
+      frame: environment frames that the policy was trained for.
+      episode: training episodes so far.
+      seconds: wall-clock of the training.
+    """
+
+    config: ml_collections.ConfigDict
+    environment: PixelEnvironment
+    act: Callable[[np.ndarray], np.ndarray]
+    demonstrations: host_demonstrations.Demonstrations | None
+    frame: int
+    episode: int
+    seconds: float
+
+
+def load(folder: pathlib.Path) -> Trained:
+    """Reads the newest whole checkpoint of a run; the run may be going on.
+
+    Args:
+      folder: `--workdir` of the run.
+
+    Raises:
+      UsageError: there is no run, no checkpoint, or it can't be read.
+    """
+    config = workdir.read_config(folder)
+    faults = experiment.problems(config)
+    if faults:
+        raise UsageError(f"{folder / 'config.json'}: {'; '.join(faults)}")
+    environment = experiment.evaluation_environment(config)
+    demonstrations = experiment.load_demonstrations(config)
+    agent = experiment.make_agent(config, environment, demonstrations)
+    try:
+        state, counters = Checkpoints(folder).restore(experiment.abstract_state(agent))
+    except CheckpointError as error:
+        raise UsageError(str(error)) from error
+    encoder, actor, _ = state.params
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        return np.asarray(agent.exploit(encoder, actor, observation))  # pyright: ignore
+
+    return Trained(
+        config=config,
+        environment=environment,
+        act=act,
+        demonstrations=demonstrations,
+        frame=counters["num_steps"] * config.action_repeat,
+        episode=counters["num_episodes"],
+        seconds=counters["seconds"],
+    )

@@ -1,0 +1,45 @@
+#!/usr/bin/env bash
+# Sets up jaxil on this machine, then trains an agent.
+#
+#   bash launch/quickstart.sh
+#       imitates ten episodes of cartpole_swingup from their pixels, with small
+#       networks that learn on two CPU cores, into runs/quickstart
+#   bash launch/quickstart.sh --config=configs/psil.py:walker_walk --workdir=runs/x
+#       runs `python -m jaxil.launch` with these flags
+#
+# The same command again goes on where it stopped. Relative paths are seen from the
+# project's root. The set-up (minutes, once) is told in launch/setup.sh.
+
+set -euo pipefail
+
+# shellcheck source-path=SCRIPTDIR source=setup.sh
+source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
+
+# As in jaxil/platform.py: a device that is hidden from CUDA or jax doesn't count.
+has_nvidia_device() {
+  case ${JAX_PLATFORMS:-} in cpu*) return 1 ;; esac
+  case ${CUDA_VISIBLE_DEVICES-all} in "" | -1) return 1 ;; esac
+  compgen -G "/dev/nvidia[0-9]*" >/dev/null || nvidia-smi --list-gpus >/dev/null 2>&1
+}
+
+extras=
+if has_nvidia_device; then
+  extras=gpu
+fi
+
+case " $* " in
+  *" --help "* | *" -h "*)
+    sed -n '2,/^$/s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"
+    cd "$root"
+    is_ready "$extras" || exit 0 # a question should not start an installation
+    ;;
+esac
+
+set_up "$extras"
+
+if (($# == 0)); then
+  set -- --config=configs/tiny.py:pdac,cartpole_swingup --workdir=runs/quickstart
+  say "Training into $root/runs/quickstart: watch learning_curve.png, videos/ and" \
+    "eval.csv there. Ctrl-C stops and saves; the same command goes on."
+fi
+exec "$venv/bin/python" -m jaxil.launch "$@"

@@ -1,0 +1,481 @@
+"""The update step against a plain rewrite of DrQ-v2, and what it may not move."""
+
+import dataclasses
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from jaxil.learner.update import Learner, init_train_state, make_update_step
+from jaxil.maths.types import Batch, Episode, ExpertBatch, ExpertEpisodes
+from jaxil.networks.agent import critic_features, make_agent_networks
+from jaxil.rewarders.adversarial import make_adversarial_rewarder
+from jaxil.rewarders.rewarder import Rewarder, Spec
+from jaxil.rewarders.sinkhorn import make_sinkhorn_rewarder
+from jaxil.rewarders.task import make_task_rewarder
+
+SIDE, CHANNELS, ACTIONS, BATCH, PADDING = 12, 6, 2, 8, 2
+TAU, NOISE_CLIP, LEARNING_RATE = 0.05, 0.3, 3e-3
+SPEC = Spec(action_dim=ACTIONS, feature_dim=5, num_demonstrations=2, expert_steps=3)
+SCHEDULE = optax.linear_schedule(1.0, 0.0, 10)
+NETWORKS = make_agent_networks(
+    action_dim=ACTIONS,
+    feature_dim=5,
+    hidden_dim=8,
+    observation="pixels",
+    channels=(4, 4),
+    kernel_sizes=(3, 3),
+    strides=(2, 1),
+    contrast=1.0,
+    mean=0.5,
+)
+
+
+def make_learner(rewarder: Rewarder | None = None, **changes) -> Learner:
+    learner = Learner(
+        networks=NETWORKS,
+        rewarder=rewarder or make_task_rewarder(),
+        learning_rate=LEARNING_RATE,
+        critic_target_tau=TAU,
+        noise_clip=NOISE_CLIP,
+        shift_padding=PADDING,
+        pre_tanh_penalty=0.0,
+        exploration_std=SCHEDULE,
+    )
+    return dataclasses.replace(learner, **changes)
+
+
+def make_state(learner: Learner, seed: int = 0):
+    """A state whose target critic is not its critic, or mixing them goes unseen."""
+    observation = np.zeros((SIDE, SIDE, CHANNELS), np.uint8)
+    state = init_train_state(learner, jax.random.key(seed), observation, SPEC)
+    other = init_train_state(learner, jax.random.key(seed + 100), observation, SPEC)
+    return state.replace(target_critic=other.target_critic)
+
+
+def make_batch(seed: int) -> Batch:
+    rng = np.random.default_rng(seed)
+    images = rng.integers(0, 256, (2, BATCH, SIDE, SIDE, CHANNELS), dtype=np.uint8)
+    return Batch(
+        observation=images[0],
+        action=rng.uniform(-1, 1, (BATCH, ACTIONS)).astype(np.float32),
+        reward=rng.normal(size=BATCH).astype(np.float32),
+        discount=rng.choice([0.0, 0.99**3], BATCH).astype(np.float32),
+        next_observation=images[1],
+    )
+
+
+def make_expert(seed: int, size: int = 4) -> ExpertBatch:
+    batch = make_batch(seed + 1000)
+    return ExpertBatch(batch.observation[:size], batch.action[:size])
+
+
+def make_pdac() -> Rewarder:
+    return make_adversarial_rewarder(
+        NETWORKS,
+        hidden_dim=8,
+        learning_rate=1e-2,
+        penalty_weight=10.0,
+        batch_size=4,
+        sees_actions=False,
+        shift_padding=PADDING,
+        frame_stack=2,
+    )
+
+
+def make_psil() -> Rewarder:
+    return make_sinkhorn_rewarder(
+        NETWORKS,
+        epsilon=0.01,
+        num_iterations=20,
+        target_update_steps=10,
+        return_scale=10.0,
+        frame_stack=2,
+    )
+
+
+@functools.cache
+def jitted(learner: Learner):
+    return jax.jit(make_update_step(learner))
+
+
+def assert_identical(first, second):
+    jax.tree.map(np.testing.assert_array_equal, first, second)
+
+
+def any_difference(first, second) -> bool:
+    leaves = jax.tree.map(lambda a, b: bool(jnp.any(a != b)), first, second)
+    return any(jax.tree.leaves(leaves))
+
+
+# A rewrite of the whole update -------------------------------------------------
+
+
+@dataclasses.dataclass
+class PlainAgent:
+    """Parameters and optimisers as DrQ-v2 keeps them, stepped one by one."""
+
+    encoder: dict
+    actor: dict
+    critic: dict
+    target_critic: dict
+    opt_states: dict
+
+
+def plain_agent(state) -> PlainAgent:
+    return PlainAgent(
+        encoder=state.encoder.params,
+        actor=state.actor.params,
+        critic=state.critic.params,
+        target_critic=state.target_critic,
+        opt_states={
+            name: getattr(state, name).opt_state
+            for name in ("encoder", "actor", "critic")
+        },
+    )
+
+
+def plain_shift(images, key):
+    corners = np.asarray(jax.random.randint(key, (BATCH, 2), 0, 2 * PADDING + 1))
+    sides = ((0, 0), (PADDING, PADDING), (PADDING, PADDING), (0, 0))
+    padded = np.pad(images, sides, mode="edge")
+    return np.stack(
+        [
+            image[row : row + SIDE, column : column + SIDE]
+            for image, (row, column) in zip(padded, corners)
+        ]
+    )
+
+
+def plain_update(agent: PlainAgent, batch: Batch, key, number: int, mistake: str = ""):
+    """One update of DrQ-v2, without the code under test but for its networks.
+
+    Args:
+      agent: changed in place.
+      batch: sampled.
+      key: base key of the run.
+      number: of this update.
+      mistake: one thing to do wrong, to see that the comparison would notice.
+
+    Returns:
+      Losses and targets.
+    """
+    encoder, actor, critic = NETWORKS
+    optimiser = optax.adam(LEARNING_RATE)
+    shift_key, next_shift_key, target_key, actor_key, _ = jax.random.split(
+        jax.random.fold_in(key, number), 5
+    )
+    std = 1.0 - number / 10.0
+    observation = plain_shift(batch.observation, shift_key)
+    next_observation = plain_shift(batch.next_observation, next_shift_key)
+
+    def step(name, gradients):
+        updates, agent.opt_states[name] = optimiser.update(
+            gradients, agent.opt_states[name]
+        )
+        new = optax.apply_updates(getattr(agent, name), updates)
+        setattr(agent, name, new)
+
+    def noise(draw_key):
+        bound = 9.0 if mistake == "noise not clipped" else NOISE_CLIP
+        normal = jax.random.normal(draw_key, (BATCH, ACTIONS))
+        return jnp.clip(std * normal, -bound, bound)
+
+    # Critic and encoder.
+    z_next = encoder.apply(agent.encoder, next_observation)
+    mean = jnp.tanh(actor.apply(agent.actor, z_next))
+    action = jnp.clip(mean + noise(target_key), -1 + 1e-6, 1 - 1e-6)
+    bootstrap_from = (
+        agent.critic if mistake == "target of live critic" else agent.target_critic
+    )
+    q1, q2 = critic.apply(bootstrap_from, z_next, action)
+    target = batch.reward + batch.discount * jnp.minimum(q1, q2)
+
+    def critic_loss(params):
+        values = critic.apply(
+            params["critic"], encoder.apply(params["encoder"], observation), batch.action
+        )
+        return jnp.mean((values[0] - target) ** 2) + jnp.mean((values[1] - target) ** 2)
+
+    z = encoder.apply(agent.encoder, observation)
+    old_critic = agent.critic
+    loss, gradients = jax.value_and_grad(critic_loss)(
+        {"critic": agent.critic, "encoder": agent.encoder}
+    )
+    step("critic", gradients["critic"])
+    step("encoder", gradients["encoder"])
+
+    # Actor: new critic, old representation.
+    judge = old_critic if mistake == "actor on old critic" else agent.critic
+    if mistake == "actor on new representation":
+        z = encoder.apply(agent.encoder, observation)
+
+    def actor_loss(params):
+        mean = jnp.tanh(actor.apply(params, z))
+        action = mean + noise(actor_key)
+        outside = jax.lax.stop_gradient(jnp.clip(action, -1 + 1e-6, 1 - 1e-6) - action)
+        if mistake == "clamp stops the gradient":
+            action = jnp.clip(action, -1 + 1e-6, 1 - 1e-6)
+            outside = 0.0
+        q1, q2 = critic.apply(judge, z, action + outside)
+        return -jnp.mean(jnp.minimum(q1, q2))
+
+    actor_value, gradients = jax.value_and_grad(actor_loss)(agent.actor)
+    step("actor", gradients)
+
+    # Target critic.
+    tau = 1.0 if mistake == "target copied" else TAU
+    agent.target_critic = jax.tree.map(
+        lambda new, old: tau * new + (1.0 - tau) * old,
+        agent.critic,
+        agent.target_critic,
+    )
+    return {"critic/loss": loss, "critic/target": target.mean(), "actor/loss": actor_value}
+
+
+def distance(state, agent: PlainAgent) -> float:
+    ours = plain_agent(state)
+    differences = jax.tree.map(
+        lambda a, b: float(np.abs(np.asarray(a) - np.asarray(b)).max()),
+        [ours.encoder, ours.actor, ours.critic, ours.target_critic],
+        [agent.encoder, agent.actor, agent.critic, agent.target_critic],
+    )
+    return max(jax.tree.leaves(differences))
+
+
+def compare(num_updates: int, mistake: str = "") -> float:
+    """Runs both side by side; returns the largest difference of any parameter."""
+    learner = make_learner()
+    state = make_state(learner)
+    agent = plain_agent(state)
+    for number in range(num_updates):
+        batch = make_batch(number)
+        expected = plain_update(agent, batch, state.key, number, mistake)
+        state, metrics = jitted(learner)(state, batch, None)
+        if not mistake:
+            for name, value in expected.items():
+                np.testing.assert_allclose(metrics[name], value, rtol=1e-4, atol=1e-5)
+    return distance(state, agent)
+
+
+def test_agrees_with_a_plain_rewrite():
+    assert compare(3) < 1e-5
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    [
+        "noise not clipped",
+        "target of live critic",
+        "actor on old critic",
+        "actor on new representation",
+        "clamp stops the gradient",
+        "target copied",
+    ],
+)
+def test_the_rewrite_would_show_a_mistake(mistake):
+    assert compare(2, mistake) > 1e-4
+
+
+# Who moves what ----------------------------------------------------------------
+
+
+def test_the_critic_target_uses_target_critic_and_live_encoder():
+    learner = make_learner(
+        shift_padding=0, exploration_std=optax.constant_schedule(0.0)
+    )
+    state, batch = make_state(learner), make_batch(0)
+    _, metrics = jitted(learner)(state, batch, None)
+    encoder, actor, critic = NETWORKS
+    z = encoder.apply(state.encoder.params, batch.next_observation)
+    action = jnp.tanh(actor.apply(state.actor.params, z))
+    values = critic.apply(state.target_critic, z, action)
+    target = batch.reward + batch.discount * jnp.min(values, axis=0)
+    np.testing.assert_allclose(metrics["critic/target"], target.mean(), rtol=1e-5)
+    live = critic.apply(state.critic.params, z, action)
+    assert np.abs(live - values).max() > 1e-2
+
+
+def test_only_the_critic_loss_moves_encoder_and_critic():
+    # Values of zero at reward zero: the critic loss and its gradient vanish, while
+    # actor and discriminator go on learning.
+    learner = make_learner(make_pdac(), pre_tanh_penalty=1.0)
+    state = make_state(learner)
+
+    def zero_heads(params):
+        layers = dict(params["params"])
+        for name in ("value_1", "value_2"):
+            output = jax.tree.map(jnp.zeros_like, layers[name]["output"])
+            layers[name] = {**layers[name], "output": output}
+        return {"params": layers}
+
+    critic = state.critic.replace(params=zero_heads(state.critic.params))
+    state = state.replace(critic=critic, target_critic=zero_heads(state.target_critic))
+    batch = make_batch(0)._replace(reward=np.zeros(BATCH, np.float32))
+    after = state
+    for _ in range(3):
+        after, metrics = jitted(learner)(after, batch, make_expert(0))
+    assert metrics["critic/loss"] == 0.0
+    assert_identical(after.encoder.params, state.encoder.params)
+    assert_identical(after.critic.params, state.critic.params)
+    assert any_difference(after.actor.params, state.actor.params)
+    assert any_difference(after.rewarder.params, state.rewarder.params)
+
+
+def test_the_actor_moves_neither_encoder_nor_critic():
+    # Without a bootstrap, the actor has no part in the critic loss: whatever the
+    # actor is, encoder and critic must come out the same to the last bit.
+    learner = make_learner()
+    state = make_state(learner)
+    other = make_state(learner, seed=7)
+    batch = make_batch(0)._replace(discount=np.zeros(BATCH, np.float32))
+    first, _ = jitted(learner)(state, batch, None)
+    second, _ = jitted(learner)(state.replace(actor=other.actor), batch, None)
+    for name in ("encoder", "critic", "target_critic"):
+        assert_identical(getattr(first, name), getattr(second, name))
+    assert any_difference(first.actor.params, second.actor.params)
+    assert any_difference(first.encoder.params, state.encoder.params)
+
+
+def test_the_discriminator_moves_nothing_else():
+    learner = make_learner(make_pdac())
+    state, batch = make_state(learner), make_batch(0)
+    first, _ = jitted(learner)(state, batch, make_expert(0))
+    second, _ = jitted(learner)(state, batch, make_expert(1))
+    assert any_difference(first.rewarder.params, second.rewarder.params)
+    assert_identical(
+        first.replace(rewarder=()), second.replace(rewarder=())
+    )
+
+
+def test_a_rewarder_with_nothing_to_learn_is_left_alone():
+    learner = make_learner(make_psil())
+    state = make_state(learner)
+    after, _ = jitted(learner)(state, make_batch(0), None)
+    assert_identical(after.rewarder, state.rewarder)
+
+
+def test_the_target_critic_follows_by_tau():
+    learner = make_learner()
+    state = make_state(learner)
+    after, _ = jitted(learner)(state, make_batch(0), None)
+    expected = jax.tree.map(
+        lambda new, old: old + TAU * (new - old),
+        after.critic.params,
+        state.target_critic,
+    )
+    chex.assert_trees_all_close(after.target_critic, expected, atol=1e-6)
+
+
+def test_the_pre_tanh_penalty_draws_the_actor_to_zero():
+    # Adam's statistics hold the gradient itself: mu = 0.1 g after one step.
+    gradients = {}
+    for weight in (0.0, 2.0, 4.0):
+        learner = make_learner(pre_tanh_penalty=weight)
+        state = make_state(learner)
+        after, _ = jitted(learner)(state, make_batch(0), None)
+        gradients[weight] = after.actor.opt_state[0].mu
+    assert any_difference(gradients[0.0], gradients[2.0])
+    chex.assert_trees_all_close(  # linear in the weight
+        jax.tree.map(lambda a, b: 2.0 * a - b, gradients[2.0], gradients[0.0]),
+        gradients[4.0],
+        atol=1e-5,
+    )
+
+
+# What the rewarder is shown ----------------------------------------------------
+
+
+def make_spy() -> Rewarder:
+    """A rewarder that remembers what it was given."""
+
+    def update(state, learner, agent, expert, key):
+        return {"learner": learner, "agent": agent, "key": key}, {"spy": jnp.ones(())}
+
+    def init(key, spec, learner):
+        return ()
+
+    def rewards(state, learner, episode, expert_episodes):
+        return episode.task_rewards, state
+
+    return Rewarder(init, update, rewards, samples_expert=False, matches_episodes=False)
+
+
+def test_the_rewarder_sees_augmented_features_of_before_the_update():
+    learner = make_learner(make_spy())
+    state, batch = make_state(learner), make_batch(0)
+    after, metrics = jitted(learner)(state, batch, None)
+    seen = after.rewarder
+    assert metrics["spy"] == 1.0
+    assert_identical(seen["learner"], state.params)
+    assert any_difference(after.params, state.params)
+    shift_key = jax.random.split(jax.random.fold_in(state.key, 0), 5)[0]
+    shifted = plain_shift(batch.observation, shift_key)
+    np.testing.assert_array_equal(seen["agent"].observation, shifted)
+    np.testing.assert_array_equal(seen["agent"].action, batch.action)
+    features = critic_features(
+        NETWORKS, state.encoder.params, state.critic.params, shifted
+    )
+    np.testing.assert_allclose(seen["agent"].features, features, atol=1e-5)
+
+
+# Keys, schedules, compilation --------------------------------------------------
+
+
+def test_draws_depend_on_the_number_of_the_update_alone():
+    learner = make_learner(exploration_std=optax.constant_schedule(0.2))
+    state, batch = make_state(learner), make_batch(0)
+    first, _ = jitted(learner)(state, batch, None)
+    again, _ = jitted(learner)(state, batch, None)
+    assert_identical(first, again)
+    later = state.replace(num_updates=jnp.asarray(5, jnp.int32))
+    other, _ = jitted(learner)(later, batch, None)
+    assert any_difference(first.encoder.params, other.encoder.params)
+    assert (first.num_updates, other.num_updates) == (1, 6)
+    assert_identical(first.key, state.key)
+
+
+@pytest.mark.parametrize(("num_updates", "std"), [(0, 1.0), (4, 0.6), (50, 0.0)])
+def test_noise_follows_the_number_of_the_update(num_updates, std):
+    learner = make_learner()
+    state = make_state(learner).replace(num_updates=jnp.asarray(num_updates, jnp.int32))
+    _, metrics = jitted(learner)(state, make_batch(0), None)
+    np.testing.assert_allclose(metrics["exploration_std"], std, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("make_rewarder", "expert"),
+    [(make_task_rewarder, None), (make_pdac, make_expert), (make_psil, None)],
+    ids=["drqv2", "pdac", "psil"],
+)
+def test_compiles_once_and_donates_its_state(make_rewarder, expert):
+    learner = make_learner(make_rewarder())
+    counted = chex.assert_max_traces(make_update_step(learner), n=1)
+    step = jax.jit(counted, donate_argnums=0)
+    rewards = jax.jit(learner.rewarder.rewards)
+    state = make_state(learner)
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 256, (3, 4, SIDE, SIDE, CHANNELS // 2), dtype=np.uint8)
+    episode = Episode(frames[0], np.zeros((3, ACTIONS), np.float32), np.zeros(3))
+    experts = ExpertEpisodes(frames[1:], np.zeros((2, 3, ACTIONS), np.float32))
+    for seed in range(3):
+        old = state
+        state, _ = step(
+            state, make_batch(seed), None if expert is None else expert(seed)
+        )
+        assert all(leaf.is_deleted() for leaf in jax.tree.leaves(old.params))
+        # An episode in between must not change the state's types.
+        _, rewarder_state = rewards(state.rewarder, state.params, episode, experts)
+        state = state.replace(rewarder=rewarder_state)
+    chex.assert_tree_all_finite(state.params)
+
+
+def test_rejects_a_column_of_rewards():
+    learner = make_learner()
+    batch = make_batch(0)._replace(reward=np.zeros((BATCH, 1), np.float32))
+    with pytest.raises(AssertionError):
+        make_update_step(learner)(make_state(learner), batch, None)

@@ -1,0 +1,111 @@
+"""The matrix form of a convolution against XLA's own, in value and gradient."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from absl.testing import parameterized
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jax import lax
+
+from jaxil.maths import convolution
+
+LAYOUT = ("NHWC", "HWIO", "NHWC")
+
+
+def reference(images, kernel, strides):
+    return lax.conv_general_dilated(
+        images, kernel, strides, "VALID", dimension_numbers=LAYOUT
+    )
+
+
+def ours(images, kernel, strides):
+    # flax hands over dimension numbers as jax has parsed them.
+    numbers = lax.conv_dimension_numbers(images.shape, kernel.shape, LAYOUT)
+    return convolution.convolve(
+        images, kernel, strides, "VALID", dimension_numbers=numbers
+    )
+
+
+def draw(seed, images_shape, kernel_shape):
+    rng = np.random.default_rng(seed)
+    return tuple(
+        rng.normal(size=shape).astype(np.float32)
+        for shape in (images_shape, kernel_shape)
+    )
+
+
+def assert_same(images, kernel, strides):
+    @jax.jit
+    def both(images, kernel):
+        results = []
+        for convolve in (ours, reference):
+            value, transpose = jax.vjp(
+                lambda x, w, f=convolve: f(x, w, strides), images, kernel
+            )
+            # Any cotangent will do that differs from place to place.
+            results.append((value, *transpose(jnp.sin(17.0 * value))))
+        return results
+
+    for result, expected in zip(*both(images, kernel), strict=True):
+        assert result.shape == expected.shape
+        np.testing.assert_allclose(result, expected, atol=1e-3)
+
+
+class ConvolveTest(chex.TestCase):
+    @chex.variants(with_jit=True, without_jit=True)
+    @parameterized.parameters(
+        (3, 1), (3, 2), (3, 4), (4, 4), (2, 2), (8, 4), (1, 1), (1, 2)
+    )
+    def test_equals_xla(self, size, stride):
+        images, kernel = draw(0, (2, 13, 13, 3), (size, size, 3, 5))
+        strides = (stride, stride)
+        value = self.variant(lambda x, w: ours(x, w, strides))(images, kernel)
+        np.testing.assert_allclose(
+            value, reference(images, kernel, strides), atol=1e-4
+        )
+
+    def test_patches_are_ordered_as_a_kernel_is(self):
+        # One window as large as the image: the patch is the image, read in order.
+        images = np.arange(2 * 3 * 4 * 2, dtype=np.float32).reshape(2, 3, 4, 2)
+        for strides in ((3, 4), (1, 2)):  # by reshape, by slices
+            patches = convolution.gather_patches(images, (3, 4), strides)
+            np.testing.assert_array_equal(patches, images.reshape(2, 1, 1, 24))
+
+
+@settings(derandomize=True, max_examples=12, deadline=None)
+@given(data=st.data())
+def test_value_and_gradients_at_any_size(data):
+    stride = data.draw(st.sampled_from([1, 2, 4]), "stride")
+    kernel = data.draw(st.tuples(st.integers(1, 5), st.integers(1, 5)), "kernel")
+    size = [side + data.draw(st.integers(0, 7)) for side in kernel]
+    channels, features = data.draw(st.integers(1, 3)), data.draw(st.integers(1, 3))
+    images, weights = draw(
+        stride, (2, *size, channels), (*kernel, channels, features)
+    )
+    assert_same(images, weights, (stride, stride))
+
+
+@settings(derandomize=True, max_examples=6, deadline=None)
+@given(
+    stride=st.sampled_from([2, 3, 4]),
+    height=st.integers(4, 11),
+    width=st.integers(4, 11),
+)
+def test_windows_that_do_not_overlap(stride, height, width):
+    images, kernel = draw(0, (2, height, width, 2), (stride, stride, 2, 3))
+    assert_same(images, kernel, (stride, stride))
+
+
+def test_strides_may_differ():
+    images, kernel = draw(0, (2, 9, 10, 2), (3, 2, 2, 4))
+    assert_same(images, kernel, (1, 2))
+    assert_same(images, kernel, (3, 2))
+
+
+def test_rejects_an_image_without_batch():
+    image, kernel = draw(0, (9, 9, 2), (3, 3, 2, 4))
+    with pytest.raises(AssertionError):
+        convolution.convolve(image, kernel, (2, 2), "VALID")

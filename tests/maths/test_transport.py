@@ -1,0 +1,156 @@
+"""Entropic transport: closed forms, marginals, and two independent solvers."""
+
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.special
+from absl.testing import parameterized
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from jaxil.maths import transport
+
+
+def plan_of(cost, *, epsilon=0.1, num_iterations=200):
+    return transport.sinkhorn_plan(
+        cost, epsilon=epsilon, num_iterations=num_iterations
+    )
+
+
+solve = jax.jit(plan_of, static_argnames=("epsilon", "num_iterations"))
+
+
+def plain_sinkhorn(cost, epsilon, num_iterations):
+    """Log-domain Sinkhorn in float64, columns first and rows last."""
+    cost = np.asarray(cost, np.float64)
+    rows, columns = cost.shape
+    f, g = np.zeros((rows, 1)), np.zeros((1, columns))
+    for _ in range(num_iterations):
+        g = -epsilon * scipy.special.logsumexp(
+            (f - cost) / epsilon, axis=0, keepdims=True
+        )
+        g = g - epsilon * np.log(columns)
+        f = -epsilon * scipy.special.logsumexp(
+            (g - cost) / epsilon, axis=1, keepdims=True
+        )
+        f = f - epsilon * np.log(rows)
+    return np.exp((f + g - cost) / epsilon)
+
+
+class CosineCostTest(chex.TestCase):
+    @chex.variants(with_jit=True, without_jit=True)
+    def test_at_0_90_and_180_degrees(self):
+        x = jnp.array([[2.0, 0.0], [0.0, 0.5]])
+        y = jnp.array([[3.0, 0.0], [0.0, 1.0], [-7.0, 0.0]])
+        cost = self.variant(transport.cosine_cost)(x, y)
+        expected = [[0.0, 1.0, 2.0], [1.0, 0.0, 1.0]]
+        np.testing.assert_allclose(cost, expected, atol=1e-6)
+
+    def test_a_zero_feature_costs_one(self):
+        cost = transport.cosine_cost(jnp.zeros((1, 3)), jnp.ones((2, 3)))
+        np.testing.assert_allclose(cost, [[1.0, 1.0]])
+
+    def test_rejects_features_of_other_sizes(self):
+        with self.assertRaises(AssertionError):
+            transport.cosine_cost(jnp.ones((2, 3)), jnp.ones((2, 4)))
+
+
+@settings(derandomize=True, max_examples=30, deadline=None)
+@given(
+    hnp.arrays(np.float32, (3, 4), elements=st.floats(-100, 100, width=32)),
+    st.floats(0.1, 100),
+)
+def test_cosine_cost_is_in_range_and_ignores_length(x, factor):
+    x = jnp.asarray(x)
+    cost = np.asarray(transport.cosine_cost(x, x))
+    assert np.all(cost >= 0.0)
+    assert np.all(cost <= 2.0)
+    lengths = np.linalg.norm(np.asarray(x), axis=1)
+    if np.all(lengths > 1e-3):
+        np.testing.assert_allclose(np.diag(cost), 0.0, atol=1e-5)
+        np.testing.assert_allclose(
+            transport.cosine_cost(x * np.float32(factor), x), cost, atol=1e-5
+        )
+
+
+class SinkhornPlanTest(chex.TestCase):
+    @chex.variants(with_jit=True, without_jit=True)
+    @parameterized.parameters(1.0, 0.1, 0.005)  # the last underflows as exp(-C / e)
+    def test_closed_form_of_two_points(self, epsilon):
+        # C = [[0, 1], [1, 0]] and k = exp(-1 / epsilon): scaling the kernel by hand
+        # gives P = [[1, k], [k, 1]] / (2 (1 + k)), balanced by symmetry.
+        cost = jnp.array([[0.0, 1.0], [1.0, 0.0]])
+        k = np.exp(-1.0 / epsilon)
+        expected = np.array([[1.0, k], [k, 1.0]]) / (2.0 * (1.0 + k))
+        plan = self.variant(functools.partial(plan_of, epsilon=epsilon))(cost)
+        np.testing.assert_allclose(plan, expected, atol=1e-6)
+
+    @parameterized.parameters(1, 7, 15, 100)
+    def test_runs_exactly_the_iterations_asked_for(self, num_iterations):
+        # Slow to converge, so that plans after different counts differ.
+        cost = 2.0 * jax.random.uniform(jax.random.key(5), (6, 4))
+        plan = solve(cost, epsilon=0.02, num_iterations=num_iterations)
+        expected = plain_sinkhorn(cost, 0.02, num_iterations)
+        np.testing.assert_allclose(plan, expected, atol=1e-5)
+        one_more = plain_sinkhorn(cost, 0.02, num_iterations + 1)
+        if num_iterations < 100:
+            assert np.abs(expected - one_more).max() > 1e-4
+
+    @parameterized.product(num_agent=(1, 7), num_expert=(1, 5))
+    def test_marginals_are_uniform(self, num_agent, num_expert):
+        plan = solve(jax.random.uniform(jax.random.key(0), (num_agent, num_expert)))
+        assert np.all(np.asarray(plan) >= 0.0)
+        np.testing.assert_allclose(plan.sum(1), 1.0 / num_agent, atol=1e-6)
+        np.testing.assert_allclose(plan.sum(0), 1.0 / num_expert, atol=1e-4)
+
+    def test_rows_are_exact_before_columns_have_converged(self):
+        cost = 2.0 * jax.random.uniform(jax.random.key(5), (6, 4))
+        plan = solve(cost, epsilon=0.02, num_iterations=1)
+        np.testing.assert_allclose(plan.sum(1), 1.0 / 6.0, atol=1e-6)
+        assert np.abs(plan.sum(0) - 0.25).max() > 1e-2
+
+    def test_reordering_the_expert_reorders_columns(self):
+        cost = jax.random.uniform(jax.random.key(1), (6, 4))
+        order = jnp.array([2, 0, 3, 1])
+        np.testing.assert_allclose(
+            solve(cost[:, order]), solve(cost)[:, order], atol=1e-6
+        )
+
+    def test_a_constant_added_to_the_cost_changes_nothing(self):
+        cost = jax.random.uniform(jax.random.key(2), (5, 5))
+        np.testing.assert_allclose(solve(cost + 0.7), solve(cost), atol=1e-5)
+
+    @parameterized.parameters(0.01, 0.001)
+    def test_small_epsilon_is_finite(self, epsilon):
+        cost = 2.0 * jax.random.uniform(jax.random.key(3), (50, 40))
+        plan = solve(cost, epsilon=epsilon, num_iterations=100)
+        chex.assert_tree_all_finite(plan)
+        np.testing.assert_allclose(plan.sum(1), 1.0 / 50.0, atol=1e-5)
+
+    def test_large_epsilon_forgets_the_cost(self):
+        plan = solve(jax.random.uniform(jax.random.key(4), (4, 5)), epsilon=1e3)
+        np.testing.assert_allclose(plan, np.full((4, 5), 1.0 / 20.0), atol=1e-4)
+
+    def test_rejects_a_batch_of_costs(self):
+        with self.assertRaises(AssertionError):
+            solve(jnp.zeros((2, 3, 3)))
+
+
+class TransportRewardsTest(chex.TestCase):
+    @chex.variants(with_jit=True, without_jit=True)
+    def test_by_hand(self):
+        rewards = self.variant(transport.transport_rewards)(
+            jnp.array([[1.0, 2.0], [0.0, 4.0]]), jnp.array([[0.5, 0.0], [0.25, 0.25]])
+        )
+        np.testing.assert_allclose(rewards, [-0.5, -1.0])
+
+    def test_sum_to_minus_the_transport_cost(self):
+        cost = jax.random.uniform(jax.random.key(0), (6, 4))
+        plan = solve(cost)
+        rewards = transport.transport_rewards(cost, plan)
+        assert np.all(np.asarray(rewards) <= 0.0)
+        np.testing.assert_allclose(rewards.sum(), -np.vdot(cost, plan), rtol=1e-6)

@@ -1,0 +1,112 @@
+"""The twin critics: sizes by hand, one trunk, two heads, the action after it."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxil.networks.agent import critic_features, make_agent_networks
+from jaxil.networks.critic import Critic
+from jaxil.networks.layers import MLP, Trunk
+
+TINY = Critic(feature_dim=5, hidden_dim=6)
+
+
+def num_parameters(tree):
+    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
+
+
+def inputs(batch=3):
+    keys = jax.random.split(jax.random.key(0), 2)
+    return jax.random.normal(keys[0], (batch, 8)), jax.random.uniform(
+        keys[1], (batch, 2)
+    )
+
+
+def test_parameters_at_the_papers_size():
+    critic = Critic(feature_dim=50, hidden_dim=1024)
+    shapes = [jax.ShapeDtypeStruct((2, size), jnp.float32) for size in (39_200, 6)]
+    params = jax.eval_shape(critic.init, jax.random.key(0), *shapes)
+    trunk = 39_200 * 50 + 50 + 2 * 50
+    head = ((50 + 6) * 1024 + 1024) + (1024 * 1024 + 1024) + (1024 + 1)
+    assert num_parameters(params["params"]["trunk"]) == trunk == 1_960_150
+    assert num_parameters(params["params"]["value_1"]) == head == 1_108_993
+    assert num_parameters(params) == trunk + 2 * head  # one trunk, two heads
+    assert jax.eval_shape(critic.apply, params, *shapes).shape == (2, 2)
+
+
+class CriticTest(chex.TestCase):
+    @chex.variants(with_jit=True, without_jit=True)
+    def test_each_value_is_an_mlp_of_features_and_action(self):
+        representation, action = inputs()
+        params = TINY.init(jax.random.key(1), representation, action)
+        layers = params["params"]
+        features = Trunk(5).apply({"params": layers["trunk"]}, representation)
+        joined = jnp.concatenate([features, action], axis=1)
+        values = self.variant(TINY.apply)(params, representation, action)
+        assert values.shape == (2, 3)
+        for value, name in zip(values, ("value_1", "value_2"), strict=True):
+            expected = MLP(6, 1).apply({"params": layers[name]}, joined)
+            np.testing.assert_allclose(value, expected[:, 0], atol=1e-6)
+
+    def test_heads_start_apart(self):
+        representation, action = inputs()
+        params = TINY.init(jax.random.key(1), representation, action)
+        first, second = TINY.apply(params, representation, action)
+        assert np.abs(first - second).max() > 1e-2
+
+    def test_features_then_values_is_the_whole(self):
+        representation, action = inputs()
+        params = TINY.init(jax.random.key(1), representation, action)
+        features = TINY.apply(params, representation, method=TINY.features)
+        values = TINY.apply(params, features, action, method=TINY.values)
+        np.testing.assert_array_equal(
+            values, TINY.apply(params, representation, action)
+        )
+
+    def test_rejects_one_action_for_a_batch(self):
+        representation, action = inputs()
+        params = TINY.init(jax.random.key(1), representation, action)
+        with self.assertRaises(AssertionError):
+            TINY.apply(params, representation, action[0])
+
+
+def test_features_of_agent_networks_are_the_critics_and_not_the_actors():
+    networks = make_agent_networks(
+        action_dim=2,
+        feature_dim=5,
+        hidden_dim=6,
+        observation="pixels",
+        channels=(4,),
+        kernel_sizes=(3,),
+        strides=(2,),
+        contrast=1.0,
+        mean=0.5,
+    )
+    images = np.random.default_rng(0).integers(0, 256, (3, 12, 12, 3), dtype=np.uint8)
+    encoder = networks.encoder.init(jax.random.key(0), images)
+    representation = networks.encoder.apply(encoder, images)
+    critic = networks.critic.init(jax.random.key(1), representation, jnp.zeros((3, 2)))
+    trunk = Trunk(5).apply({"params": critic["params"]["trunk"]}, representation)
+    features = critic_features(networks, encoder, critic, jnp.asarray(images))
+    np.testing.assert_allclose(features, trunk, atol=1e-6)
+
+
+def test_state_vectors_go_straight_to_the_trunk():
+    networks = make_agent_networks(
+        action_dim=2,
+        feature_dim=5,
+        hidden_dim=6,
+        observation="state",
+        channels=(4,),
+        kernel_sizes=(3,),
+        strides=(2,),
+        contrast=1.0,
+        mean=0.5,
+    )
+    vectors = jax.random.normal(jax.random.key(0), (3, 7))
+    encoder = networks.encoder.init(jax.random.key(0), vectors)
+    critic = networks.critic.init(jax.random.key(1), vectors, jnp.zeros((3, 2)))
+    trunk = Trunk(5).apply({"params": critic["params"]["trunk"]}, vectors)
+    features = critic_features(networks, encoder, critic, vectors)
+    np.testing.assert_allclose(features, trunk, atol=1e-6)

@@ -1,0 +1,123 @@
+"""The encoder at the paper's size, and its arithmetic on tiny images."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from absl.testing import parameterized
+from jax import lax
+
+from jaxil.networks.encoder import PixelEncoder, StateEncoder, output_side
+
+TINY = PixelEncoder(channels=(4, 4), kernel_sizes=(3, 3), strides=(2, 1))
+
+
+def num_parameters(tree):
+    return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
+
+
+def random_images(shape=(2, 12, 12, 3), seed=0):
+    return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
+
+
+class PaperSizeTest(chex.TestCase):
+    def test_39200_features_and_30368_parameters(self):
+        encoder = PixelEncoder()
+        images = jax.ShapeDtypeStruct((5, 84, 84, 9), jnp.uint8)
+        params = jax.eval_shape(encoder.init, jax.random.key(0), images)
+        # 3 * 3 * 9 * 32 + 32, then three times 3 * 3 * 32 * 32 + 32
+        assert num_parameters(params) == 2_624 + 3 * 9_248 == 30_368
+        features = jax.eval_shape(encoder.apply, params, images)
+        assert features.shape == (5, 39_200)
+        assert features.dtype == jnp.float32
+        assert 39_200 == 32 * 35 * 35
+
+    @parameterized.parameters(
+        (84, (3, 3, 3, 3), (2, 1, 1, 1), 35), (12, (3, 3), (2, 1), 3), (8, (4,), (4,), 2)
+    )
+    def test_output_side(self, side, kernel_sizes, strides, expected):
+        assert output_side(side, kernel_sizes, strides) == expected
+        encoder = PixelEncoder((2,) * len(strides), kernel_sizes, strides)
+        images = jax.ShapeDtypeStruct((1, side, side, 3), jnp.uint8)
+        params = jax.eval_shape(encoder.init, jax.random.key(0), images)
+        features = jax.eval_shape(encoder.apply, params, images)
+        assert features.shape == (1, 2 * expected**2)
+
+    def test_too_small_an_image_has_no_side(self):
+        assert output_side(6, (3, 3, 3), (2, 1, 1)) < 1
+
+
+class ArithmeticTest(chex.TestCase):
+    @chex.variants(with_jit=True, without_jit=True)
+    def test_is_the_plain_chain_of_convolutions(self):
+        images = random_images()
+        params = TINY.init(jax.random.key(0), images)
+        # Biases that are not zero, or leaving them out would go unseen.
+        params = jax.tree.map(lambda leaf: leaf + 0.1, params)
+        x = images.astype(np.float32) / 255.0 - 0.5
+        for name, stride in (("Conv_0", 2), ("Conv_1", 1)):
+            layer = params["params"][name]
+            x = lax.conv_general_dilated(
+                x,
+                layer["kernel"],
+                (stride, stride),
+                "VALID",
+                dimension_numbers=("NHWC", "HWIO", "NHWC"),
+            )
+            x = jnp.maximum(x + layer["bias"][None, None, None], 0.0)
+        features = self.variant(TINY.apply)(params, images)
+        np.testing.assert_allclose(features, x.reshape(2, -1), atol=1e-5)
+
+    @parameterized.parameters((1.0, 0.5), (4.0, 0.25))
+    def test_pixels_are_centred_and_scaled(self, contrast, mean):
+        # A 1 x 1 convolution with an identity kernel shows its input.
+        encoder = PixelEncoder((3,), (1,), (1,), contrast, mean)
+        params = {"params": {"Conv_0": {"kernel": jnp.eye(3)[None, None]}}}
+        params["params"]["Conv_0"]["bias"] = jnp.full(3, 5.0)  # keeps ReLU open
+        images = random_images()
+        expected = contrast * (images / 255.0 - mean) + 5.0
+        np.testing.assert_allclose(
+            encoder.apply(params, images), expected.reshape(2, -1), atol=1e-5
+        )
+
+    def test_a_mean_image_is_subtracted_pixel_by_pixel(self):
+        images = random_images((1, 12, 12, 3))
+        own_mean = images[0] / np.float32(255.0)
+        encoder = PixelEncoder((4, 4), (3, 3), (2, 1), 1.0, own_mean)
+        params = TINY.init(jax.random.key(0), images)
+        two = np.concatenate([images, random_images((1, 12, 12, 3), seed=1)])
+        features = np.asarray(encoder.apply(params, two))
+        # Its own mean leaves nothing of the first image; the second is still there.
+        np.testing.assert_allclose(features[0], 0.0, atol=1e-6)
+        assert features[1].max() > 0.1
+
+    def test_images_do_not_see_each_other(self):
+        images = random_images((3, 12, 12, 3))
+        params = TINY.init(jax.random.key(0), images)
+        alone = TINY.apply(params, images[1:2])
+        np.testing.assert_allclose(
+            TINY.apply(params, images)[1:2], alone, atol=1e-6
+        )
+
+
+def test_kernels_are_orthogonal_with_gain_root_two_and_biases_zero():
+    encoder = PixelEncoder((8, 8), (3, 3), (2, 1))
+    params = encoder.init(jax.random.key(0), random_images())["params"]
+    for layer in params.values():
+        kernel = np.asarray(layer["kernel"]).reshape(-1, 8)
+        np.testing.assert_allclose(kernel.T @ kernel, 2.0 * np.eye(8), atol=1e-5)
+        np.testing.assert_array_equal(layer["bias"], np.zeros(8))
+
+
+def test_state_vectors_pass_unchanged():
+    encoder = StateEncoder()
+    vectors = np.random.default_rng(0).normal(size=(3, 5)).astype(np.float32)
+    params = encoder.init(jax.random.key(0), vectors)
+    assert not jax.tree.leaves(params)
+    np.testing.assert_array_equal(encoder.apply(params, vectors), vectors)
+
+
+def test_an_image_without_batch_is_rejected():
+    with pytest.raises(AssertionError):
+        TINY.init(jax.random.key(0), random_images()[0])
