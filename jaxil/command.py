@@ -4,8 +4,10 @@ Exit status: 0 done; 2 wrong use, with one message that names every fault; 1 els
 """
 
 import contextlib
+import pathlib
 import sys
 from collections.abc import Callable, Iterator
+from typing import Any
 
 from absl import flags
 from ml_collections import config_flags
@@ -37,7 +39,7 @@ def parse(argv: list[str], description: str, define: Define) -> flags.FlagValues
         print(f"{description.strip()}\n\n{values.main_module_help()}{_help(values)}")
         raise SystemExit(0)
     problems: list[str] = []
-    arguments = list(argv)
+    arguments = [word for word in argv if not _names_missing_file(word, problems)]
     while True:
         values = flags.FlagValues()
         define(values)
@@ -49,6 +51,7 @@ def parse(argv: list[str], description: str, define: Define) -> flags.FlagValues
             problems.append(_sentence(culprit, error, values))
             if culprit is None:
                 break
+            # Without the faulty word, the next fault comes to light.
             arguments.remove(culprit)
             continue
         except (OSError, SyntaxError, ImportError) as error:
@@ -63,6 +66,19 @@ def parse(argv: list[str], description: str, define: Define) -> flags.FlagValues
         problems += _value_problems(values)
         raise UsageError(listing(problems))
     return values
+
+
+def _names_missing_file(word: str, problems: list[str]) -> bool:
+    """Says whether a word is `--config=FILE[:ARG]` without such a file."""
+    name, _, value = word.lstrip("-").partition("=")
+    path = pathlib.Path(value.split(":")[0])
+    if not word.startswith("-") or name != "config" or path.is_file():
+        return False
+    problems.append(
+        f"--config={value!r}: there is no file {str(path)!r} here; the presets are in "
+        "configs/, such as configs/pdac.py:walker_walk"
+    )
+    return True
 
 
 def listing(faults: list[str]) -> str:
@@ -151,9 +167,7 @@ def _sentence(culprit: str | None, error: Exception, values: flags.FlagValues) -
 
 
 def _field_names(values: flags.FlagValues) -> Iterator[str]:
-    config = values["config"].value if "config" in values else None
-    if config is None or not hasattr(config, "items"):
-        config = jaxil_config.default_config()
+    config = _config_of(values) or jaxil_config.default_config()
     for name, value in config.items():
         if hasattr(value, "items"):
             yield from (f"{name}.{inner}" for inner in value)
@@ -161,23 +175,34 @@ def _field_names(values: flags.FlagValues) -> Iterator[str]:
             yield name
 
 
+def _config_of(values: flags.FlagValues) -> Any:
+    """Returns the parsed config; None where there is none or it can't be loaded."""
+    if "config" not in values:
+        return None
+    config = values["config"].value
+    try:
+        # ml_collections keeps a file's error until something of it is read.
+        return config if hasattr(config, "items") else None
+    except Exception:
+        return None
+
+
 def _config_file_problems(values: flags.FlagValues) -> list[str]:
     config = values["config"].value
     if config is None:
         return ["--config is missing: give a file, such as configs/pdac_walker.py"]
-    if hasattr(config, "items"):
-        return []
-    # ml_collections keeps an error from the file until a field of it is read.
     try:
-        config.items  # noqa: B018
-    except Exception as error:
-        return [f"--config: {str(error).strip().splitlines()[-1]}"]
+        has_fields = hasattr(config, "items")
+    except Exception as error:  # whatever the user's file raised
+        return [f"--config: {str(error).strip().splitlines()[0]}"]
+    if has_fields:
+        return []
     return ["--config: the file's get_config() must return a ConfigDict"]
 
 
 def _value_problems(values: flags.FlagValues) -> list[str]:
-    config = values["config"].value if "config" in values else None
-    if config is None or not hasattr(config, "items"):
+    config = _config_of(values)
+    if config is None:
         return []
     from jaxil import platform
 

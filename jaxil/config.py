@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import ml_collections
 
 from jaxil.host import replay
-from jaxil.networks import encoder
 
 METHODS = {
     "pdac": "adversarial rewards on the critic's features (P-DAC)",
@@ -133,7 +132,7 @@ def problems(
 
 def unknown_name(field: str, value: object, known: tuple[str, ...]) -> str:
     """Returns a sentence about a name that does not exist, with the closest ones."""
-    close = difflib.get_close_matches(str(value), known, n=3)
+    close = difflib.get_close_matches(str(value), known, n=3, cutoff=0.5)
     shown = close or (known if len(known) <= 12 else known[:12])
     more = "" if len(shown) == len(known) or close else ", ..."
     hint = "did you mean" if close else "choose one of"
@@ -228,7 +227,9 @@ def _problems(
             f"exploration_std_end={config.exploration_std_end} is above "
             f"exploration_std_start={config.exploration_std_start}; noise must not grow"
         )
-    if config.method == "pdac" and config.discriminator.batch_size > config.batch_size:
+    both = {"batch_size", "discriminator.batch_size"} <= in_range
+    too_large = both and config.discriminator.batch_size > config.batch_size
+    if config.method == "pdac" and too_large:
         yield (
             f"discriminator.batch_size={config.discriminator.batch_size} is above "
             f"batch_size={config.batch_size}: it reuses the agent's encoded samples; "
@@ -259,15 +260,13 @@ def _encoder_problems(config: ml_collections.ConfigDict) -> Iterator[str]:
             return
     if config.observation != "pixels":
         return
-    side = encoder.output_side(
-        config.image_size, settings.kernel_sizes, settings.strides
-    )
-    if side < 1:
-        smallest = next(
-            size
-            for size in range(1, 10**5)
-            if encoder.output_side(size, settings.kernel_sizes, settings.strides) >= 1
-        )
+    # Backwards through the layers: each needs (side - 1) * stride + kernel pixels.
+    smallest = 1
+    for size, stride in zip(
+        reversed(settings.kernel_sizes), reversed(settings.strides), strict=True
+    ):
+        smallest = (smallest - 1) * stride + size
+    if config.image_size < smallest:
         yield (
             f"image_size={config.image_size} is too small for the encoder: its "
             f"convolutions leave nothing; use at least {smallest}"

@@ -1,13 +1,13 @@
 """What a run stands on: versions, device, renderer, memory."""
 
 import importlib.metadata
-import pathlib
 import platform as python_platform
 from typing import Any
 
 import ml_collections
 
 from jaxil import config as jaxil_config
+from jaxil import platform
 
 _PACKAGES = (
     "jaxil",
@@ -43,27 +43,6 @@ def describe(gl_name: str) -> dict[str, Any]:
     }
 
 
-def available_bytes() -> int | None:
-    """Returns the memory that is free for a new process; None where unknown."""
-    free = []
-    try:
-        for line in pathlib.Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                free.append(int(line.split()[1]) * 1024)
-    except OSError:
-        pass
-    # A container's limit can be far below what the machine has.
-    group = pathlib.Path("/sys/fs/cgroup")
-    try:
-        limit = (group / "memory.max").read_text().strip()
-        used = int((group / "memory.current").read_text())
-        if limit != "max":
-            free.append(int(limit) - used)
-    except (OSError, ValueError):
-        pass
-    return min(free, default=None)
-
-
 def memory_sentence(config: ml_collections.ConfigDict) -> str:
     """Says what the replay will take, before it is allocated."""
     if config.observation != "pixels":
@@ -73,7 +52,7 @@ def memory_sentence(config: ml_collections.ConfigDict) -> str:
         f"replay: {config.replay_size_steps} steps of {config.image_size}x"
         f"{config.image_size} pixels take {needed / 1e9:.2f} GB when full"
     )
-    free = available_bytes()
+    free = platform.available_memory_bytes()
     if free is not None and needed + _BESIDE_THE_REPLAY > free:
         text += (
             f"; WARNING: {free / 1e9:.1f} GB are free: lower replay_size_steps or "

@@ -114,6 +114,9 @@ class Renderer:
         # Both are read when the GL context is made, so they must be set before.
         if render_quality == "fast":
             vis.quality.offsamples = 0
+            # Spheres of fewer triangles: half or less of the time, 0.1 to 0.2 grey
+            # levels of mean difference at 48x48.
+            vis.quality.numslices, vis.quality.numstacks = 12, 8
         vis.global_.offwidth = max(int(vis.global_.offwidth), image_size)
         vis.global_.offheight = max(int(vis.global_.offheight), image_size)
 

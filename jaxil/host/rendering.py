@@ -14,7 +14,7 @@ import numpy as np
 from jaxil.host import environment as environments
 
 # Part of each key: raise it when drawing changes in a way that the key can't see.
-_CACHE_VERSION = 1
+_CACHE_VERSION = 2
 
 _logger = logging.getLogger(__name__)
 

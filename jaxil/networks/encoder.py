@@ -62,18 +62,3 @@ class StateEncoder(nn.Module):
         """Maps [B, S] to [B, S]."""
         chex.assert_rank(observation, 2)
         return observation.astype(jnp.float32)
-
-
-def output_side(
-    side: int, kernel_sizes: tuple[int, ...], strides: tuple[int, ...]
-) -> int:
-    """Returns the side of the last feature map; below 1 the image is too small.
-
-    Args:
-      side: height or width of the image, in pixels.
-      kernel_sizes: as in `PixelEncoder`.
-      strides: as in `PixelEncoder`.
-    """
-    for size, stride in zip(kernel_sizes, strides, strict=True):
-        side = (side - size) // stride + 1
-    return side
