@@ -108,7 +108,9 @@ def test_a_seed_says_all():
 
 def test_actor_and_critic_trunks_are_drawn_apart():
     params = tiny_state().params
-    actor, critic = (tree["params"]["trunk"]["project"]["kernel"] for tree in params[1:])
+    actor, critic = (
+        tree["params"]["trunk"]["project"]["kernel"] for tree in params[1:]
+    )
     assert actor.shape == critic.shape
     assert np.abs(actor - critic).max() > 1e-2
 

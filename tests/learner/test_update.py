@@ -35,10 +35,34 @@ NETWORKS = make_agent_networks(
 )
 
 
-def make_learner(rewarder: Rewarder | None = None, **changes) -> Learner:
+# Made once: a learner is compiled once for all tests that share it.
+TASK = make_task_rewarder()
+PDAC = make_adversarial_rewarder(
+    NETWORKS,
+    hidden_dim=8,
+    learning_rate=1e-2,
+    penalty_weight=10.0,
+    batch_size=4,
+    sees_actions=False,
+    shift_padding=PADDING,
+    frame_stack=2,
+)
+PSIL = make_sinkhorn_rewarder(
+    NETWORKS,
+    epsilon=0.01,
+    num_iterations=20,
+    target_update_steps=10,
+    return_scale=10.0,
+    frame_stack=2,
+)
+STEADY = optax.constant_schedule(0.2)
+QUIET = optax.constant_schedule(0.0)
+
+
+def make_learner(rewarder: Rewarder = TASK, **changes) -> Learner:
     learner = Learner(
         networks=NETWORKS,
-        rewarder=rewarder or make_task_rewarder(),
+        rewarder=rewarder,
         learning_rate=LEARNING_RATE,
         critic_target_tau=TAU,
         noise_clip=NOISE_CLIP,
@@ -72,30 +96,6 @@ def make_batch(seed: int) -> Batch:
 def make_expert(seed: int, size: int = 4) -> ExpertBatch:
     batch = make_batch(seed + 1000)
     return ExpertBatch(batch.observation[:size], batch.action[:size])
-
-
-def make_pdac() -> Rewarder:
-    return make_adversarial_rewarder(
-        NETWORKS,
-        hidden_dim=8,
-        learning_rate=1e-2,
-        penalty_weight=10.0,
-        batch_size=4,
-        sees_actions=False,
-        shift_padding=PADDING,
-        frame_stack=2,
-    )
-
-
-def make_psil() -> Rewarder:
-    return make_sinkhorn_rewarder(
-        NETWORKS,
-        epsilon=0.01,
-        num_iterations=20,
-        target_update_steps=10,
-        return_scale=10.0,
-        frame_stack=2,
-    )
 
 
 @functools.cache
@@ -197,7 +197,9 @@ def plain_update(agent: PlainAgent, batch: Batch, key, number: int, mistake: str
 
     def critic_loss(params):
         values = critic.apply(
-            params["critic"], encoder.apply(params["encoder"], observation), batch.action
+            params["critic"],
+            encoder.apply(params["encoder"], observation),
+            batch.action,
         )
         return jnp.mean((values[0] - target) ** 2) + jnp.mean((values[1] - target) ** 2)
 
@@ -234,7 +236,11 @@ def plain_update(agent: PlainAgent, batch: Batch, key, number: int, mistake: str
         agent.critic,
         agent.target_critic,
     )
-    return {"critic/loss": loss, "critic/target": target.mean(), "actor/loss": actor_value}
+    return {
+        "critic/loss": loss,
+        "critic/target": target.mean(),
+        "actor/loss": actor_value,
+    }
 
 
 def distance(state, agent: PlainAgent) -> float:
@@ -285,9 +291,7 @@ def test_the_rewrite_would_show_a_mistake(mistake):
 
 
 def test_the_critic_target_uses_target_critic_and_live_encoder():
-    learner = make_learner(
-        shift_padding=0, exploration_std=optax.constant_schedule(0.0)
-    )
+    learner = make_learner(shift_padding=0, exploration_std=QUIET)
     state, batch = make_state(learner), make_batch(0)
     _, metrics = jitted(learner)(state, batch, None)
     encoder, actor, critic = NETWORKS
@@ -303,7 +307,7 @@ def test_the_critic_target_uses_target_critic_and_live_encoder():
 def test_only_the_critic_loss_moves_encoder_and_critic():
     # Values of zero at reward zero: the critic loss and its gradient vanish, while
     # actor and discriminator go on learning.
-    learner = make_learner(make_pdac(), pre_tanh_penalty=1.0)
+    learner = make_learner(PDAC, pre_tanh_penalty=1.0)
     state = make_state(learner)
 
     def zero_heads(params):
@@ -342,18 +346,16 @@ def test_the_actor_moves_neither_encoder_nor_critic():
 
 
 def test_the_discriminator_moves_nothing_else():
-    learner = make_learner(make_pdac())
+    learner = make_learner(PDAC)
     state, batch = make_state(learner), make_batch(0)
     first, _ = jitted(learner)(state, batch, make_expert(0))
     second, _ = jitted(learner)(state, batch, make_expert(1))
     assert any_difference(first.rewarder.params, second.rewarder.params)
-    assert_identical(
-        first.replace(rewarder=()), second.replace(rewarder=())
-    )
+    assert_identical(first.replace(rewarder=()), second.replace(rewarder=()))
 
 
 def test_a_rewarder_with_nothing_to_learn_is_left_alone():
-    learner = make_learner(make_psil())
+    learner = make_learner(PSIL)
     state = make_state(learner)
     after, _ = jitted(learner)(state, make_batch(0), None)
     assert_identical(after.rewarder, state.rewarder)
@@ -427,7 +429,7 @@ def test_the_rewarder_sees_augmented_features_of_before_the_update():
 
 
 def test_draws_depend_on_the_number_of_the_update_alone():
-    learner = make_learner(exploration_std=optax.constant_schedule(0.2))
+    learner = make_learner(exploration_std=STEADY)
     state, batch = make_state(learner), make_batch(0)
     first, _ = jitted(learner)(state, batch, None)
     again, _ = jitted(learner)(state, batch, None)
@@ -448,12 +450,12 @@ def test_noise_follows_the_number_of_the_update(num_updates, std):
 
 
 @pytest.mark.parametrize(
-    ("make_rewarder", "expert"),
-    [(make_task_rewarder, None), (make_pdac, make_expert), (make_psil, None)],
+    ("rewarder", "expert"),
+    [(TASK, None), (PDAC, make_expert), (PSIL, None)],
     ids=["drqv2", "pdac", "psil"],
 )
-def test_compiles_once_and_donates_its_state(make_rewarder, expert):
-    learner = make_learner(make_rewarder())
+def test_compiles_once_and_donates_its_state(rewarder, expert):
+    learner = make_learner(rewarder)
     counted = chex.assert_max_traces(make_update_step(learner), n=1)
     step = jax.jit(counted, donate_argnums=0)
     rewards = jax.jit(learner.rewarder.rewards)

@@ -6,6 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from absl.testing import parameterized
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -137,8 +138,10 @@ class RandomShiftTest(chex.TestCase):
         assert not np.array_equal(first, other)
 
     def test_rejects_a_single_image(self):
-        with self.assertRaises(AssertionError):
-            augmentation.random_shift(jnp.zeros((4, 4, 3)), jax.random.key(0), padding=1)
+        with pytest.raises(AssertionError):
+            augmentation.random_shift(
+                jnp.zeros((4, 4, 3)), jax.random.key(0), padding=1
+            )
 
 
 @settings(derandomize=True, max_examples=12, deadline=None)

@@ -63,9 +63,7 @@ class ConvolveTest(chex.TestCase):
         images, kernel = draw(0, (2, 13, 13, 3), (size, size, 3, 5))
         strides = (stride, stride)
         value = self.variant(lambda x, w: ours(x, w, strides))(images, kernel)
-        np.testing.assert_allclose(
-            value, reference(images, kernel, strides), atol=1e-4
-        )
+        np.testing.assert_allclose(value, reference(images, kernel, strides), atol=1e-4)
 
     def test_patches_are_ordered_as_a_kernel_is(self):
         # One window as large as the image: the patch is the image, read in order.
@@ -82,9 +80,7 @@ def test_value_and_gradients_at_any_size(data):
     kernel = data.draw(st.tuples(st.integers(1, 5), st.integers(1, 5)), "kernel")
     size = [side + data.draw(st.integers(0, 7)) for side in kernel]
     channels, features = data.draw(st.integers(1, 3)), data.draw(st.integers(1, 3))
-    images, weights = draw(
-        stride, (2, *size, channels), (*kernel, channels, features)
-    )
+    images, weights = draw(stride, (2, *size, channels), (*kernel, channels, features))
     assert_same(images, weights, (stride, stride))
 
 

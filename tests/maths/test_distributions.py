@@ -6,6 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from absl.testing import parameterized
 
 from jaxil.maths import distributions
@@ -92,7 +93,7 @@ class TruncatedNormalTest(chex.TestCase):
         np.testing.assert_array_equal(actions, mean)
 
     def test_rejects_a_vector_of_deviations(self):
-        with self.assertRaises(AssertionError):
+        with pytest.raises(AssertionError):
             distributions.sample_truncated_normal(
                 jnp.zeros((2, 3)), jnp.ones(3), jax.random.key(0), noise_clip=None
             )

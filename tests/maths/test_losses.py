@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import pytest
 from absl.testing import parameterized
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -32,7 +33,7 @@ class TdTargetTest(chex.TestCase):
 
     @parameterized.parameters(((3, 1), (3,)), ((3,), (4,)))
     def test_rejects_shapes_that_would_broadcast(self, reward_shape, discount_shape):
-        with self.assertRaises(AssertionError):
+        with pytest.raises(AssertionError):
             losses.td_target(
                 jnp.ones(reward_shape), jnp.ones(discount_shape), jnp.ones((2, 3))
             )
@@ -52,7 +53,7 @@ class CriticLossTest(chex.TestCase):
         np.testing.assert_allclose(gradient, [[1.0, 0.0], [3.0, 3.0]])
 
     def test_rejects_a_column_of_targets(self):
-        with self.assertRaises(AssertionError):
+        with pytest.raises(AssertionError):
             losses.critic_loss(jnp.ones((2, 3)), jnp.ones((3, 1)))
 
 
@@ -104,7 +105,7 @@ class DiscriminatorLossTest(chex.TestCase):
         np.testing.assert_allclose(gradients, [[-slope], [slope]])
 
     def test_rejects_unequal_batches(self):
-        with self.assertRaises(AssertionError):
+        with pytest.raises(AssertionError):
             losses.discriminator_loss(jnp.ones(3), jnp.ones(4))
 
 

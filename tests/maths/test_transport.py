@@ -6,6 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import scipy.special
 from absl.testing import parameterized
 from hypothesis import given, settings
@@ -16,9 +17,7 @@ from jaxil.maths import transport
 
 
 def plan_of(cost, *, epsilon=0.1, num_iterations=200):
-    return transport.sinkhorn_plan(
-        cost, epsilon=epsilon, num_iterations=num_iterations
-    )
+    return transport.sinkhorn_plan(cost, epsilon=epsilon, num_iterations=num_iterations)
 
 
 solve = jax.jit(plan_of, static_argnames=("epsilon", "num_iterations"))
@@ -55,7 +54,7 @@ class CosineCostTest(chex.TestCase):
         np.testing.assert_allclose(cost, [[1.0, 1.0]])
 
     def test_rejects_features_of_other_sizes(self):
-        with self.assertRaises(AssertionError):
+        with pytest.raises(AssertionError):
             transport.cosine_cost(jnp.ones((2, 3)), jnp.ones((2, 4)))
 
 
@@ -136,7 +135,7 @@ class SinkhornPlanTest(chex.TestCase):
         np.testing.assert_allclose(plan, np.full((4, 5), 1.0 / 20.0), atol=1e-4)
 
     def test_rejects_a_batch_of_costs(self):
-        with self.assertRaises(AssertionError):
+        with pytest.raises(AssertionError):
             solve(jnp.zeros((2, 3, 3)))
 
 

@@ -19,9 +19,7 @@ def assert_orthogonal(kernel):
     kernel = np.asarray(kernel)
     if kernel.shape[0] < kernel.shape[1]:
         kernel = kernel.T
-    np.testing.assert_allclose(
-        kernel.T @ kernel, np.eye(kernel.shape[1]), atol=1e-5
-    )
+    np.testing.assert_allclose(kernel.T @ kernel, np.eye(kernel.shape[1]), atol=1e-5)
 
 
 def test_parameters_at_the_papers_size():

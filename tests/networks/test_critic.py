@@ -4,6 +4,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxil.networks.agent import critic_features, make_agent_networks
 from jaxil.networks.critic import Critic
@@ -67,7 +68,7 @@ class CriticTest(chex.TestCase):
     def test_rejects_one_action_for_a_batch(self):
         representation, action = inputs()
         params = TINY.init(jax.random.key(1), representation, action)
-        with self.assertRaises(AssertionError):
+        with pytest.raises(AssertionError):
             TINY.apply(params, representation, action[0])
 
 

@@ -34,7 +34,9 @@ class PaperSizeTest(chex.TestCase):
         assert 39_200 == 32 * 35 * 35
 
     @parameterized.parameters(
-        (84, (3, 3, 3, 3), (2, 1, 1, 1), 35), (12, (3, 3), (2, 1), 3), (8, (4,), (4,), 2)
+        (84, (3, 3, 3, 3), (2, 1, 1, 1), 35),
+        (12, (3, 3), (2, 1), 3),
+        (8, (4,), (4,), 2),
     )
     def test_output_side(self, side, kernel_sizes, strides, expected):
         assert output_side(side, kernel_sizes, strides) == expected
@@ -96,9 +98,7 @@ class ArithmeticTest(chex.TestCase):
         images = random_images((3, 12, 12, 3))
         params = TINY.init(jax.random.key(0), images)
         alone = TINY.apply(params, images[1:2])
-        np.testing.assert_allclose(
-            TINY.apply(params, images)[1:2], alone, atol=1e-6
-        )
+        np.testing.assert_allclose(TINY.apply(params, images)[1:2], alone, atol=1e-6)
 
 
 def test_kernels_are_orthogonal_with_gain_root_two_and_biases_zero():

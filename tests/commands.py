@@ -1,0 +1,59 @@
+"""How the tests start the project's commands, at sizes that take seconds."""
+
+import os
+import pathlib
+import subprocess
+import sys
+
+ROOT = pathlib.Path(__file__).parent.parent
+# Ten frames per decision make an episode of 100 decisions.
+SMALL = (
+    "--config.action_repeat=10",
+    "--config.image_size=24",
+    "--config.encoder.channels=(4,4)",
+    "--config.encoder.kernel_sizes=(4,3)",
+    "--config.encoder.strides=(4,1)",
+    "--config.hidden_dim=16",
+    "--config.feature_dim=8",
+    "--config.batch_size=8",
+    "--config.discriminator.batch_size=8",
+    "--config.discriminator.hidden_dim=16",
+    "--config.demonstrations.num_episodes=2",
+    "--config.sinkhorn.target_update_steps=150",
+    "--config.sinkhorn.num_iterations=10",
+    "--config.replay_size_steps=1000",
+    "--config.exploration_steps=50",
+    "--config.seed_frames=1000",
+    "--config.update_every_steps=10",
+    "--config.num_eval_episodes=1",
+    "--config.eval_every_frames=2000",
+    "--config.checkpoint_every_frames=2000",
+    "--config.total_frames=4000",
+)
+
+
+def arguments(module: str, *flags: str) -> list[str]:
+    """Returns the command line of `python -m jaxil.MODULE FLAGS`."""
+    return [sys.executable, "-m", f"jaxil.{module}", *flags]
+
+
+def run(module: str, *flags: str, timeout: float = 240.0):
+    """Runs a command to its end; returns it with status and output."""
+    return subprocess.run(
+        arguments(module, *flags),
+        check=False,
+        cwd=ROOT,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+    )
+
+
+def small_run(method: str, workdir: pathlib.Path) -> tuple[str, ...]:
+    """Returns the flags of a run of seconds."""
+    return (
+        f"--config=configs/tiny.py:{method},ball_in_cup_catch",
+        f"--workdir={workdir}",
+        *SMALL,
+    )

@@ -1,0 +1,146 @@
+"""Whole runs on a real task, as a user types them."""
+
+import json
+import os
+import signal
+import subprocess
+import time
+
+import numpy as np
+import pytest
+
+from jaxil.host.metrics import read_csv
+from tests.commands import ROOT, arguments, run, small_run
+
+_CLOCKS = ("seconds", "frames_per_second", "reward_seconds")
+
+
+def test_pdac_trains_shows_itself_and_is_evaluated_again(tmp_path):
+    finished = run("launch", *small_run("pdac", tmp_path))
+    assert finished.returncode == 0, finished.stderr
+
+    train = read_csv(tmp_path / "train.csv")
+    np.testing.assert_array_equal(train["frame"], [1000, 2000, 3000, 4000])
+    assert np.all(train["length"] == 100)
+    assert np.all(np.isfinite(train["imitation_return"]))
+    assert np.all(np.isfinite(train["discriminator/expert_logit"][1:]))
+    evals = read_csv(tmp_path / "eval.csv")
+    np.testing.assert_array_equal(evals["frame"], [2000, 4000])
+    assert np.all(evals["expert_task_return_mean"] > 800)
+    settings = json.loads((tmp_path / "config.json").read_text())
+    assert settings["config"]["method"] == "pdac"
+    assert settings["versions"]["jax"]
+    assert settings["renderer"]
+    assert (tmp_path / "learning_curve.png").stat().st_size > 5_000
+    assert list((tmp_path / "videos").glob("*.mp4"))
+    assert list((tmp_path / "tensorboard").iterdir())
+
+    again = run("evaluate", f"--workdir={tmp_path}", "--num_episodes=2")
+    assert again.returncode == 0, again.stderr
+    assert again.stdout.count("episode ") == 2
+    assert (tmp_path / "videos" / "evaluation.mp4").stat().st_size > 1_000
+
+    # The same command once more finds nothing left to do.
+    before = (tmp_path / "train.csv").read_text()
+    assert run("launch", *small_run("pdac", tmp_path)).returncode == 0
+    assert (tmp_path / "train.csv").read_text() == before
+
+
+@pytest.mark.parametrize("method", ["psil", "drqv2", "zero"])
+def test_method_trains(method, tmp_path):
+    finished = run(
+        "launch", *small_run(method, tmp_path), "--config.total_frames=3000"
+    )
+    assert finished.returncode == 0, finished.stderr
+    train = read_csv(tmp_path / "train.csv")
+    assert len(train["frame"]) == 3
+    if method == "psil":
+        # The first episode is scaled to minus ten, and the scale then stays.
+        assert train["imitation_return"][0] == pytest.approx(-10.0, rel=1e-4)
+        assert len(set(train["sinkhorn/scale"])) == 1
+    elif method == "drqv2":
+        np.testing.assert_array_equal(train["imitation_return"], train["task_return"])
+    else:
+        assert not train["imitation_return"].any()
+
+
+def test_state_expert_is_recorded_and_imitated(tmp_path):
+    expert = tmp_path / "expert"
+    flags = (
+        "--config=configs/expert.py:cartpole_swingup",
+        "--config.total_frames=1000",
+        "--config.seed_frames=500",
+        "--config.action_repeat=10",
+        "--config.num_eval_episodes=1",
+    )
+    assert run("launch", *flags, f"--workdir={expert}").returncode == 0
+    output = tmp_path / "demonstrations.npz"
+    recorded = run(
+        "collect", f"--workdirs={expert}", f"--output={output}", "--num_episodes=2"
+    )
+    assert recorded.returncode == 0, recorded.stderr
+    imitated = run(
+        "launch",
+        *small_run("pdac", tmp_path / "agent"),
+        "--config.task=cartpole_swingup",
+        f"--config.demonstrations.source={output}",
+        "--config.total_frames=1000",
+    )
+    assert imitated.returncode == 0, imitated.stderr
+
+
+def test_resumes_bit_for_bit_after_a_kill(tmp_path):
+    unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
+    assert run("launch", *small_run("pdac", unbroken)).returncode == 0
+
+    process = subprocess.Popen(
+        arguments("launch", *small_run("pdac", broken)),
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+    )
+    # Killed with an episode begun after the first checkpoint.
+    _wait_for(lambda: list(broken.glob("checkpoints/frame_000000002000*")), process)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (broken / "checkpoints" / "frame_000000004000").exists()
+
+    resumed = run("launch", *small_run("pdac", broken))
+    assert resumed.returncode == 0, resumed.stderr
+    assert "going on from the checkpoint of frame 2000" in resumed.stderr
+    expected, got = (read_csv(folder / "train.csv") for folder in (unbroken, broken))
+    assert list(expected) == list(got)
+    for column in expected:
+        if column not in _CLOCKS:
+            np.testing.assert_array_equal(got[column], expected[column], column)
+    expected, got = (read_csv(folder / "eval.csv") for folder in (unbroken, broken))
+    np.testing.assert_array_equal(got["task_return_mean"], expected["task_return_mean"])
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path):
+    flags = (*small_run("zero", tmp_path), "--config.total_frames=1000000")
+    process = subprocess.Popen(
+        arguments("launch", *flags),
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+    )
+    rows = tmp_path / "train.csv"
+    _wait_for(lambda: rows.exists() and rows.read_text().count("\n") > 2, process)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert "the same command goes on from there" in stderr
+    assert "Traceback" not in stderr
+    assert list((tmp_path / "checkpoints").glob("frame_*"))
+
+
+def _wait_for(condition, process, seconds: float = 200.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, "the run ended too soon"
+        assert time.monotonic() < end, "the run is too slow"
+        time.sleep(0.02)

@@ -1,0 +1,152 @@
+"""Each wrong use ends with status 2 and one message: field, value, rule, way out."""
+
+import numpy as np
+import pytest
+
+from jaxil import config as jaxil_config
+from jaxil import experiment
+from jaxil.host import demonstrations
+from tests.commands import run, small_run
+
+_TASKS = ("walker_walk", "cartpole_swingup")
+
+# (field, value, what the sentence must name)
+_BAD_VALUES = (
+    ("method", "gail", ("gail", "psil")),
+    ("task", "walker_wlak", ("walker_wlak", "did you mean", "walker_walk")),
+    ("observation", "pixel", ("pixels",)),
+    ("render_quality", "best", ("paper", "fast")),
+    ("batch_size", 0, ("batch_size=0", "256 in the paper")),
+    ("batch_size", -3, ("batch_size=-3",)),
+    ("learning_rate", 0.0, ("learning_rate=0.0", "(0, 1]")),
+    ("learning_rate", float("nan"), ("nan",)),
+    ("discount_factor", 1.5, ("discount_factor=1.5", "0.99")),
+    ("critic_target_tau", 2.0, ("critic_target_tau=2.0",)),
+    ("sinkhorn.epsilon", float("inf"), ("sinkhorn.epsilon=inf",)),
+    ("total_frames", 1_000_001, ("not a multiple of action_repeat=2", "1000000")),
+    ("image_size", 10, ("too small for the encoder", "at least 15")),
+    ("encoder.strides", (2, 1), ("lengths differ",)),
+    ("encoder.channels", (32, 0, 32, 32), ("encoder.channels",)),
+    ("exploration_std_end", 2.0, ("noise must not grow",)),
+    ("discriminator.batch_size", 512, ("at most 256",)),
+    ("replay_size_steps", 10, ("replay_size_steps=10",)),
+    ("demonstrations.num_episodes", 0, ("demonstrations.num_episodes=0",)),
+)
+
+
+@pytest.mark.parametrize(("field", "value", "expected"), _BAD_VALUES)
+def test_a_bad_value_is_named_with_rule_and_way_out(field, value, expected):
+    config = jaxil_config.default_config("pdac", "walker_walk")
+    target, leaf = config, field
+    if "." in field:
+        group, leaf = field.split(".")
+        target = config[group]
+    target[leaf] = value
+    faults = jaxil_config.problems(config, _TASKS)
+    assert len(faults) == 1
+    for word in expected:
+        assert word in faults[0]
+
+
+def test_the_defaults_are_fine_on_every_task():
+    for method in jaxil_config.METHODS:
+        config = jaxil_config.default_config(method, "walker_walk")
+        assert jaxil_config.problems(config, _TASKS) == []
+
+
+def test_smallest_image_is_the_one_that_leaves_one_pixel():
+    config = jaxil_config.default_config("pdac", "walker_walk")
+    config.image_size = 15  # 15 -> 7 -> 5 -> 3 -> 1
+    assert jaxil_config.problems(config, _TASKS) == []
+
+
+def test_all_faults_come_in_one_message_without_a_traceback(tmp_path):
+    finished = run(
+        "launch",
+        "--config=configs/pdac.py:walker_wlak",
+        f"--workdir={tmp_path}/file/run",
+        "--config.batch_size=-3",
+        "--config.bath_size=3",
+        "--config.learning_rate=fast",
+        "--bogus=1",
+    )
+    assert finished.returncode == 2
+    assert "Traceback" not in finished.stderr
+    for word in ("walker_walk", "batch_size=-3", "bath_size", "'fast'", "--bogus"):
+        assert word in finished.stderr
+
+
+def test_a_second_config_in_the_same_folder_is_refused(tmp_path):
+    flags = (*small_run("zero", tmp_path), "--config.total_frames=1000")
+    assert run("launch", *flags).returncode == 0
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    other = run("launch", *flags, "--config.seed=1", "--config.noise_clip=0.2")
+    assert other.returncode == 2
+    assert "seed: 0 there, 1 here" in other.stderr
+    assert "noise_clip: 0.3 there, 0.2 here" in other.stderr
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        (["--workdir=x"], "--config is missing"),
+        (["--config=nowhere.py", "--workdir=x"], "there is no file 'nowhere.py'"),
+        (["--config=configs/tiny.py:pdac", "--workdir=x"], "METHOD,TASK"),
+        (["--config=configs/pdac.py"], "--workdir is missing"),
+        (["--config=configs/pdac.py", "--workdir=/proc/x"], "can't be written"),
+        (["--config=setup.cfg", "--workdir=x"], "--config"),
+        (["--config=configs/pdac.py", "--workdir=x", "stray"], "'stray'"),
+    ],
+)
+def test_wrong_command_lines(flags, expected):
+    finished = run("launch", *flags)
+    assert finished.returncode == 2
+    assert expected in finished.stderr
+    assert "Traceback" not in finished.stderr
+
+
+def test_demonstrations_are_checked_before_anything_starts(tmp_path):
+    config = jaxil_config.default_config("pdac", "walker_walk")
+    cut_off = tmp_path / "cut.npz"
+    whole = demonstrations.shipped_path("ball_in_cup_catch").read_bytes()
+    cut_off.write_bytes(whole[: len(whole) // 2])
+    sources = {
+        str(tmp_path / "none.npz"): "none.npz",
+        str(cut_off): "cut.npz",
+        str(demonstrations.shipped_path("ball_in_cup_catch")): "ball_in_cup_catch",
+    }
+    for source, expected in sources.items():
+        config.demonstrations.source = source
+        faults = experiment.problems(config)
+        assert len(faults) == 1
+        assert expected in faults[0]
+
+    config = jaxil_config.default_config("pdac", "ball_in_cup_catch")
+    config.demonstrations.num_episodes = 10_000
+    (fault,) = experiment.problems(config)
+    assert "10000" in fault
+
+
+@pytest.mark.parametrize("command", ["evaluate", "collect", "benchmark", "launch"])
+def test_help_says_what_the_command_does(command):
+    finished = run(command, "--help")
+    assert finished.returncode == 0
+    assert f"python -m jaxil.{command}" in finished.stdout
+
+
+@pytest.mark.parametrize("command", ["evaluate", "collect"])
+def test_a_folder_without_a_run_is_said(command, tmp_path):
+    flag = "workdir" if command == "evaluate" else "workdirs"
+    extra = [f"--output={tmp_path}/out.npz"] if command == "collect" else []
+    finished = run(command, f"--{flag}={tmp_path}", *extra)
+    assert finished.returncode == 2
+    assert "holds no run" in finished.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_values_that_are_not_finite_are_numbers_to_numpy():
+    # The door uses math.isfinite, which takes NumPy's floats too.
+    config = jaxil_config.default_config("pdac", "walker_walk")
+    config.discount_factor = float(np.float32("nan"))
+    assert len(jaxil_config.problems(config, _TASKS)) == 1
