@@ -1,6 +1,6 @@
 r"""DrQ-v2 from pixels on the true reward: the backbone, and the paper's experts.
 
-    python -m jaxil.launch --config=configs/drqv2.py:cheetah_run --workdir=runs/drqv2
+python -m jaxil.launch --config=configs/drqv2.py:cheetah_run --workdir=runs/drqv2
 """
 
 from jaxil import config as jaxil_config

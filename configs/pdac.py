@@ -1,6 +1,6 @@
 r"""P-DAC at the paper's settings, on any task.
 
-    python -m jaxil.launch --config=configs/pdac.py:cheetah_run --workdir=runs/pdac
+python -m jaxil.launch --config=configs/pdac.py:cheetah_run --workdir=runs/pdac
 """
 
 from jaxil import config as jaxil_config

@@ -1,6 +1,6 @@
 r"""P-SIL at the paper's settings, on any task.
 
-    python -m jaxil.launch --config=configs/psil.py:cheetah_run --workdir=runs/psil
+python -m jaxil.launch --config=configs/psil.py:cheetah_run --workdir=runs/psil
 """
 
 from jaxil import config as jaxil_config

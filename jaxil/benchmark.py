@@ -5,6 +5,7 @@ r"""Times the parts of a run on this machine, and the loop that joins them.
 Medians over repeats, after a warm-up; nothing is learned and nothing kept.
 """
 
+import io
 import json
 import pathlib
 import platform as python_platform
@@ -76,6 +77,7 @@ def measure(config: Any, *, repeats: int, steps: int) -> dict[str, Any]:
     import jax
 
     from jaxil import train
+    from jaxil.host.progress import ProgressLine
 
     config = config.copy_and_resolve_references()
     with config.unlocked():
@@ -89,7 +91,8 @@ def measure(config: Any, *, repeats: int, steps: int) -> dict[str, Any]:
 
         demonstrations = experiment.load_demonstrations(config)
         run = train.Run(config, pathlib.Path(folder), demonstrations, print)
-        run.progress.update = lambda *_: None  # a benchmark prints its table only
+        # A benchmark prints its table only.
+        run.progress = ProgressLine(config.total_frames, stream=io.StringIO())
         episode = _random_episode(run, config)
         run.replay.add_episode(
             frames=episode.frames,

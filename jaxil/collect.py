@@ -3,8 +3,9 @@ r"""Records demonstrations of the best of some trained experts.
     python -m jaxil.collect --workdirs=runs/expert0,runs/expert1 \
         --output=jaxil/demonstrations/cartpole_swingup.npz --num_episodes=50
 
-Each run's policy is evaluated by its mean action; the best one plays the episodes. The
-file holds simulator states, not pixels: whoever trains renders them as their agent sees.
+Each run's policy is evaluated by its mean action; the best one plays the episodes.
+The file holds simulator states, not pixels: whoever trains renders them as their agent
+sees.
 """
 
 import pathlib
@@ -22,7 +23,9 @@ _SEED = 777
 def main(argv: list[str]) -> None:
     """Runs the command."""
     values = command.parse(argv, __doc__ or "", _define)
-    missing = [f"--{n} is missing" for n in ("workdirs", "output") if not values[n].value]
+    missing = [
+        f"--{n} is missing" for n in ("workdirs", "output") if not values[n].value
+    ]
     if missing:
         raise command.UsageError(command.listing(missing))
     from jaxil import platform
@@ -55,16 +58,20 @@ def main(argv: list[str]) -> None:
     except (OSError, demonstrations.DemonstrationError) as error:
         raise command.UsageError(f"--output={values.output}: {error}") from error
     returns = states.rewards.sum(axis=1)
+    size = pathlib.Path(values.output).stat().st_size / 1e6
     print(
         f"{values.output}: {len(returns)} episodes of {values.workdirs[best]}, return "
         f"mean {returns.mean():.1f}, minimum {returns.min():.1f}, maximum "
-        f"{returns.max():.1f}, {pathlib.Path(values.output).stat().st_size / 1e6:.2f} MB"
+        f"{returns.max():.1f}, {size:.2f} MB"
     )
 
 
 def _define(values: flags.FlagValues) -> None:
     flags.DEFINE_list(
-        "workdirs", [], "folders of runs of one task, comma-separated", flag_values=values
+        "workdirs",
+        [],
+        "folders of runs of one task, comma-separated",
+        flag_values=values,
     )
     flags.DEFINE_string("output", None, "file to write, NAME.npz", flag_values=values)
     flags.DEFINE_integer(

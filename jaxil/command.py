@@ -57,7 +57,9 @@ def parse(argv: list[str], description: str, define: Define) -> flags.FlagValues
         except (OSError, SyntaxError, ImportError) as error:
             problems.append(f"--config: the file can't be read: {error}")
             break
-        problems += [f"{word!r} is not a flag; flags start with --" for word in rest[1:]]
+        problems += [
+            f"{word!r} is not a flag; flags start with --" for word in rest[1:]
+        ]
         break
     if "config" in values and not problems:
         problems += _config_file_problems(values)

@@ -3,10 +3,14 @@
 import difflib
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import ml_collections
 
 from jaxil.host import replay
+
+# An ml_collections.ConfigDict, whose fields no type checker can know.
+Config = Any
 
 METHODS = {
     "pdac": "adversarial rewards on the critic's features (P-DAC)",
@@ -22,13 +26,13 @@ _EASY_TASKS = ("cartpole_swingup", "finger_spin", "ball_in_cup_catch")
 _EASY_FRAMES, _HARD_FRAMES = 1_500_000, 5_000_000
 
 
-def default_config(method: str = "pdac", task: str = "cartpole_swingup"):
+def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Config:
     """Returns the paper's settings for a method on a task.
 
     Durations end in their unit: `_frames` are environment frames, before action
     repeat; `_steps` are the agent's decisions.
     """
-    config = ml_collections.ConfigDict()
+    config: Config = ml_collections.ConfigDict()
     config.method = method
     config.task = task
     config.seed = 0
@@ -96,12 +100,12 @@ def default_config(method: str = "pdac", task: str = "cartpole_swingup"):
     return config
 
 
-def uses_demonstrations(config: ml_collections.ConfigDict) -> bool:
+def uses_demonstrations(config: Config) -> bool:
     """Says whether a run of this config reads demonstrations."""
     return config.method in ("pdac", "psil") or config.encoder.subtract_mean_image
 
 
-def memory_bytes(config: ml_collections.ConfigDict) -> int:
+def memory_bytes(config: Config) -> int:
     """Returns what the replay of this config will hold when full, in bytes.
 
     For pixels only; state vectors are small.
@@ -115,9 +119,7 @@ def memory_bytes(config: ml_collections.ConfigDict) -> int:
     )
 
 
-def problems(
-    config: ml_collections.ConfigDict, known_tasks: tuple[str, ...]
-) -> list[str]:
+def problems(config: Config, known_tasks: tuple[str, ...]) -> list[str]:
     """Checks every field.
 
     Args:
@@ -146,7 +148,11 @@ _RANGES: dict[str, tuple[float, float, str]] = {
     "image_size": (8, 1024, "84 in the paper"),
     "frame_stack": (1, 16, "3 in the paper"),
     "total_frames": (1, 10**10, "the run's length in environment frames"),
-    "replay_size_steps": (1_000, 10**8, "it must hold whole episodes; 150000 in the paper"),
+    "replay_size_steps": (
+        1_000,
+        10**8,
+        "it must hold whole episodes; 150000 in the paper",
+    ),
     "batch_size": (1, 65_536, "256 in the paper"),
     "num_steps": (1, 100, "3 in the paper, 1 on walker tasks"),
     "discount_factor": (0.0, 1.0, "0.99 in the paper"),
@@ -184,16 +190,14 @@ _WHOLE_DECISIONS = (
 )
 
 
-def _read(config: ml_collections.ConfigDict, field: str):
+def _read(config: Config, field: str):
     value = config
     for part in field.split("."):
         value = value[part]
     return value
 
 
-def _problems(
-    config: ml_collections.ConfigDict, known_tasks: tuple[str, ...]
-) -> Iterator[str]:
+def _problems(config: Config, known_tasks: tuple[str, ...]) -> Iterator[str]:
     """Yields one sentence for each fault."""
     if config.method not in METHODS:
         yield unknown_name("method", config.method, tuple(METHODS))
@@ -243,7 +247,7 @@ def _problems(
     yield from _encoder_problems(config)
 
 
-def _encoder_problems(config: ml_collections.ConfigDict) -> Iterator[str]:
+def _encoder_problems(config: Config) -> Iterator[str]:
     settings = config.encoder
     lengths = {
         name: len(settings[name]) for name in ("channels", "kernel_sizes", "strides")

@@ -3,11 +3,11 @@
 from typing import Any, NamedTuple
 
 import jax
-import ml_collections
 import numpy as np
 import optax
 
 from jaxil import config as jaxil_config
+from jaxil.config import Config
 from jaxil.host import demonstrations as host_demonstrations
 from jaxil.host.environment import (
     PixelEnvironment,
@@ -54,14 +54,14 @@ class Agent(NamedTuple):
     init_state: Any
 
 
-def problems(config: ml_collections.ConfigDict) -> list[str]:
+def problems(config: Config) -> list[str]:
     """Returns one sentence for each reason why a config can't be run here.
 
     Reads the demonstration file, but renders nothing.
     """
     faults = jaxil_config.problems(config, known_tasks())
-    wants = jaxil_config.uses_demonstrations(config)
-    if wants and config.task in known_tasks() and config.demonstrations.num_episodes > 0:
+    readable = config.task in known_tasks() and config.demonstrations.num_episodes > 0
+    if readable and jaxil_config.uses_demonstrations(config):
         try:
             host_demonstrations.check(
                 config.demonstrations.source,
@@ -70,11 +70,13 @@ def problems(config: ml_collections.ConfigDict) -> list[str]:
                 action_repeat=config.action_repeat,
             )
         except host_demonstrations.DemonstrationError as error:
-            faults.append(f"demonstrations.source={config.demonstrations.source!r}: {error}")
+            faults.append(
+                f"demonstrations.source={config.demonstrations.source!r}: {error}"
+            )
     return faults
 
 
-def renderer_name(config: ml_collections.ConfigDict) -> str:
+def renderer_name(config: Config) -> str:
     """Returns what GL calls the device that will draw this run's pixels.
 
     Raises:
@@ -86,19 +88,17 @@ def renderer_name(config: ml_collections.ConfigDict) -> str:
     return name
 
 
-def training_environment(config: ml_collections.ConfigDict) -> PixelEnvironment:
+def training_environment(config: Config) -> PixelEnvironment:
     """Returns the environment that gathers experience."""
     return environment_with_seed(config, config.seed)
 
 
-def evaluation_environment(config: ml_collections.ConfigDict) -> PixelEnvironment:
+def evaluation_environment(config: Config) -> PixelEnvironment:
     """Returns an environment of its own, with starts of its own."""
     return environment_with_seed(config, config.seed + _EVALUATION_SEED)
 
 
-def environment_with_seed(
-    config: ml_collections.ConfigDict, seed: int
-) -> PixelEnvironment:
+def environment_with_seed(config: Config, seed: int) -> PixelEnvironment:
     """Returns the run's environment with another seed for its resets."""
     return make_environment(
         config.task,
@@ -112,7 +112,7 @@ def environment_with_seed(
 
 
 def load_demonstrations(
-    config: ml_collections.ConfigDict, progress: Any = None
+    config: Config, progress: Any = None
 ) -> host_demonstrations.Demonstrations | None:
     """Returns the demonstrations of a run, rendered as the agent sees; or None.
 
@@ -133,9 +133,7 @@ def load_demonstrations(
     )
 
 
-def make_replay(
-    config: ml_collections.ConfigDict, environment: PixelEnvironment
-) -> Replay:
+def make_replay(config: Config, environment: PixelEnvironment) -> Replay:
     """Returns an empty replay of the config's size."""
     frame = environment.reset(episode=0) and environment.single_observation()
     return Replay(
@@ -150,12 +148,12 @@ def make_replay(
     )
 
 
-def stack_size(config: ml_collections.ConfigDict) -> int:
+def stack_size(config: Config) -> int:
     """Returns the frames in an observation: state vectors are not stacked."""
     return config.frame_stack if config.observation == "pixels" else 1
 
 
-def exploration_schedule(config: ml_collections.ConfigDict) -> optax.Schedule:
+def exploration_schedule(config: Config) -> optax.Schedule:
     """Returns the noise's standard deviation by agent step."""
     return optax.linear_schedule(
         config.exploration_std_start,
@@ -164,9 +162,7 @@ def exploration_schedule(config: ml_collections.ConfigDict) -> optax.Schedule:
     )
 
 
-def make_networks(
-    config: ml_collections.ConfigDict, action_dim: int, mean: Any
-) -> AgentNetworks:
+def make_networks(config: Config, action_dim: int, mean: Any) -> AgentNetworks:
     """Returns the agent's networks.
 
     Args:
@@ -188,7 +184,7 @@ def make_networks(
 
 
 def mean_image(
-    config: ml_collections.ConfigDict,
+    config: Config,
     demonstrations: host_demonstrations.Demonstrations | None,
 ) -> Any:
     """Returns what the encoder subtracts: 0.5, or the demonstrations' mean image."""
@@ -202,9 +198,7 @@ def mean_image(
     return np.concatenate([mean] * config.frame_stack, axis=-1)
 
 
-def make_rewarder(
-    config: ml_collections.ConfigDict, networks: AgentNetworks
-) -> Rewarder:
+def make_rewarder(config: Config, networks: AgentNetworks) -> Rewarder:
     """Returns the imitation method that the config names."""
     if config.method == "pdac":
         return make_adversarial_rewarder(
@@ -232,7 +226,7 @@ def make_rewarder(
 
 
 def make_agent(
-    config: ml_collections.ConfigDict,
+    config: Config,
     environment: PixelEnvironment,
     demonstrations: host_demonstrations.Demonstrations | None,
 ) -> Agent:

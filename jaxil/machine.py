@@ -4,10 +4,9 @@ import importlib.metadata
 import platform as python_platform
 from typing import Any
 
-import ml_collections
-
 from jaxil import config as jaxil_config
 from jaxil import platform
+from jaxil.config import Config
 
 _PACKAGES = (
     "jaxil",
@@ -43,7 +42,7 @@ def describe(gl_name: str) -> dict[str, Any]:
     }
 
 
-def memory_sentence(config: ml_collections.ConfigDict) -> str:
+def memory_sentence(config: Config) -> str:
     """Says what the replay will take, before it is allocated."""
     if config.observation != "pixels":
         return "replay of state vectors: small"

@@ -3,9 +3,9 @@
 import pathlib
 from typing import Any
 
-import ml_collections
 import numpy as np
 
+from jaxil.config import Config
 from jaxil.host import demonstrations as host_demonstrations
 from jaxil.host import metrics as host_metrics
 from jaxil.host import video
@@ -36,7 +36,7 @@ class Outputs:
     def __init__(
         self,
         workdir: pathlib.Path,
-        config: ml_collections.ConfigDict,
+        config: Config,
         demonstrations: host_demonstrations.Demonstrations | None,
         resume_frame: int | None,
     ) -> None:
@@ -117,7 +117,9 @@ class Outputs:
         )
         if evaluation.video is not None:
             self._write_video(evaluation.video, frame)
-        line = f"frame {frame}: task return {evaluation.mean:.1f} ± {evaluation.std:.1f}"
+        line = (
+            f"frame {frame}: task return {evaluation.mean:.1f} ± {evaluation.std:.1f}"
+        )
         if self._expert_return is not None:
             line += f", the expert's {self._expert_return:.1f}"
         if self._pre_tanh > _SATURATED:

@@ -5,15 +5,14 @@ import pathlib
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import jax
-import ml_collections
 import numpy as np
 
 from jaxil import experiment, outputs
-from jaxil.config import METHODS
+from jaxil.config import METHODS, Config
 from jaxil.host import demonstrations as host_demonstrations
 from jaxil.host.checkpoint import Checkpoints
 from jaxil.host.evaluation import evaluate
@@ -78,7 +77,7 @@ class Run:
 
     def __init__(
         self,
-        config: ml_collections.ConfigDict,
+        config: Config,
         workdir: pathlib.Path,
         demonstrations: host_demonstrations.Demonstrations | None,
         say: Callable[[str], None],
@@ -156,9 +155,9 @@ class Run:
             self.agent.explore(
                 encoder,
                 actor,
-                observation,  # pyright: ignore[reportArgumentType]
+                observation,
                 self.exploration_key,
-                np.uint32(num_steps),  # pyright: ignore[reportArgumentType]
+                np.uint32(num_steps),
             )
         )
 
@@ -223,9 +222,9 @@ class Run:
     def reward(self, episode: FinishedEpisode) -> np.ndarray:
         """Returns the rewarder's rewards [T]; its state moves on."""
         device_episode = Episode(
-            episode.frames,  # pyright: ignore[reportArgumentType]
-            episode.actions,  # pyright: ignore[reportArgumentType]
-            episode.task_rewards,  # pyright: ignore[reportArgumentType]
+            episode.frames,
+            episode.actions,
+            episode.task_rewards,
         )
         rewards, rewarder = self.agent.rewards(
             self.state.rewarder, self.state.params, device_episode, self.experts
@@ -240,9 +239,9 @@ class Run:
             good = self.checkpoints.newest()
             where = "there is none" if good is None else f"that of frame {good}"
             raise TrainingDiverged(
-                f"{', '.join(bad)} became infinite or NaN by frame {self.frame} (update "
-                f"{int(self.state.num_updates)}). Last good checkpoint: {where}. Lower "
-                "learning_rate, or look at train.csv for what grew before"
+                f"{', '.join(bad)} became infinite or NaN by frame {self.frame} "
+                f"(update {int(self.state.num_updates)}). Last good checkpoint: "
+                f"{where}. Lower learning_rate, or look at train.csv for what grew before"
             )
 
     def evaluate(self) -> None:
@@ -317,7 +316,7 @@ class _TimedEnvironment:
         self.single_observation = environment.single_observation
 
 
-def train(config: ml_collections.ConfigDict, workdir: pathlib.Path) -> bool:
+def train(config: Config, workdir: pathlib.Path) -> bool:
     """Trains a run to its end, or on to its end.
 
     Args:
@@ -331,6 +330,7 @@ def train(config: ml_collections.ConfigDict, workdir: pathlib.Path) -> bool:
       DemonstrationError: the demonstrations can't serve this run.
       TrainingDiverged: losses or rewards are not finite any more.
     """
+
     def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 

@@ -4,11 +4,11 @@ import pathlib
 from collections.abc import Callable
 from typing import NamedTuple
 
-import ml_collections
 import numpy as np
 
 from jaxil import experiment, workdir
 from jaxil.command import UsageError
+from jaxil.config import Config
 from jaxil.host import demonstrations as host_demonstrations
 from jaxil.host.checkpoint import CheckpointError, Checkpoints
 from jaxil.host.environment import PixelEnvironment
@@ -27,7 +27,7 @@ class Trained(NamedTuple):
       seconds: wall-clock of the training.
     """
 
-    config: ml_collections.ConfigDict
+    config: Config
     environment: PixelEnvironment
     act: Callable[[np.ndarray], np.ndarray]
     demonstrations: host_demonstrations.Demonstrations | None
@@ -59,7 +59,7 @@ def load(folder: pathlib.Path) -> Trained:
     encoder, actor, _ = state.params
 
     def act(observation: np.ndarray) -> np.ndarray:
-        return np.asarray(agent.exploit(encoder, actor, observation))  # pyright: ignore
+        return np.asarray(agent.exploit(encoder, actor, observation))
 
     return Trained(
         config=config,

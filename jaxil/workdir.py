@@ -11,12 +11,13 @@ from typing import Any
 import ml_collections
 
 from jaxil.command import UsageError
+from jaxil.config import Config
 
 # A run may be prolonged without becoming another run.
 _FREE_FIELDS = ("total_frames",)
 
 
-def problems(workdir: pathlib.Path, config: ml_collections.ConfigDict) -> list[str]:
+def problems(workdir: pathlib.Path, config: Config) -> list[str]:
     """Returns one sentence for each reason why a run can't live in a folder.
 
     Args:
@@ -56,7 +57,7 @@ def opened(workdir: pathlib.Path) -> Iterator[None]:
     """
     try:
         workdir.mkdir(parents=True, exist_ok=True)
-        lock = open(workdir / "lock", "w")
+        lock = (workdir / "lock").open("w")
     except OSError as error:
         raise UsageError(
             f"workdir={str(workdir)!r} can't be written ({error.strerror}); choose a "
@@ -73,7 +74,7 @@ def opened(workdir: pathlib.Path) -> Iterator[None]:
         yield
 
 
-def read_config(workdir: pathlib.Path) -> ml_collections.ConfigDict:
+def read_config(workdir: pathlib.Path) -> Config:
     """Returns the config of the run in a folder.
 
     Raises:
@@ -94,7 +95,7 @@ def read_config(workdir: pathlib.Path) -> ml_collections.ConfigDict:
 
 
 def write_config(
-    workdir: pathlib.Path, config: ml_collections.ConfigDict, machine: dict[str, Any]
+    workdir: pathlib.Path, config: Config, machine: dict[str, Any]
 ) -> None:
     """Writes config.json: every setting in force, and what it runs on."""
     text = json.dumps({"config": config.to_dict(), **machine}, indent=2)
@@ -103,9 +104,7 @@ def write_config(
     os.replace(temporary, workdir / "config.json")
 
 
-def _differences(
-    there: ml_collections.ConfigDict, here: ml_collections.ConfigDict
-) -> list[str]:
+def _differences(there: Config, here: Config) -> list[str]:
     # Through JSON, which turns tuples into lists, so that both have the same types.
     before = _flat(json.loads(json.dumps(there.to_dict())))
     now = _flat(json.loads(json.dumps(here.to_dict())))

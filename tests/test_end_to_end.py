@@ -48,9 +48,7 @@ def test_pdac_trains_shows_itself_and_is_evaluated_again(tmp_path):
 
 @pytest.mark.parametrize("method", ["psil", "drqv2", "zero"])
 def test_method_trains(method, tmp_path):
-    finished = run(
-        "launch", *small_run(method, tmp_path), "--config.total_frames=3000"
-    )
+    finished = run("launch", *small_run(method, tmp_path), "--config.total_frames=3000")
     assert finished.returncode == 0, finished.stderr
     train = read_csv(tmp_path / "train.csv")
     assert len(train["frame"]) == 3

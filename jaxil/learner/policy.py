@@ -8,11 +8,11 @@ import optax
 from jax import Array
 
 from jaxil.maths import distributions
-from jaxil.maths.types import Params
-from jaxil.networks.agent import AgentNetworks
+from jaxil.maths.types import Data, Params
+from jaxil.networks.agent import AgentNetworks, apply
 
-Explore = Callable[[Params, Params, Array, Array, Array], Array]
-Exploit = Callable[[Params, Params, Array], Array]
+Explore = Callable[[Params, Params, Data, Array, Data], Array]
+Exploit = Callable[[Params, Params, Data], Array]
 
 
 def make_explore(networks: AgentNetworks, exploration_std: optax.Schedule) -> Explore:
@@ -29,7 +29,7 @@ def make_explore(networks: AgentNetworks, exploration_std: optax.Schedule) -> Ex
     exploit = make_exploit(networks)
 
     def explore(
-        encoder: Params, actor: Params, observation: Array, key: Array, num_steps: Array
+        encoder: Params, actor: Params, observation: Data, key: Array, num_steps: Data
     ) -> Array:
         mean = exploit(encoder, actor, observation)
         std = jnp.asarray(exploration_std(num_steps), mean.dtype)
@@ -50,8 +50,8 @@ def make_exploit(networks: AgentNetworks) -> Exploit:
       networks: the agent's.
     """
 
-    def exploit(encoder: Params, actor: Params, observation: Array) -> Array:
-        representation = networks.encoder.apply(encoder, observation[None])
-        return jnp.tanh(networks.actor.apply(actor, representation))[0]
+    def exploit(encoder: Params, actor: Params, observation: Data) -> Array:
+        representation = apply(networks.encoder, encoder, observation[None])
+        return jnp.tanh(apply(networks.actor, actor, representation))[0]
 
     return exploit

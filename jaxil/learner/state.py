@@ -25,16 +25,14 @@ class LearnerParams(NamedTuple):
     critic: Params
 
 
-@struct.dataclass
-class ModuleState:
+class ModuleState(struct.PyTreeNode):
     """Parameters of one network with the state of its optimiser."""
 
     params: Params
     opt_state: optax.OptState
 
 
-@struct.dataclass
-class TrainState:
+class TrainState(struct.PyTreeNode):
     """All that `update_step` reads and writes; a pytree, donated at each call.
 
     Hyperparameters are absent on purpose: the update closes over them, so a

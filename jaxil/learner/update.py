@@ -17,8 +17,8 @@ from jaxil.learner.state import (
     init_module,
 )
 from jaxil.maths import augmentation, distributions, losses
-from jaxil.maths.types import Batch, ExpertBatch, Metrics, Params
-from jaxil.networks.agent import AgentNetworks
+from jaxil.maths.types import Batch, Data, ExpertBatch, Metrics, Params
+from jaxil.networks.agent import AgentNetworks, apply
 from jaxil.rewarders.rewarder import AgentView, Rewarder, Spec
 
 UpdateStep = Callable[
@@ -57,7 +57,7 @@ class Learner:
 
 
 def init_train_state(
-    learner: Learner, key: Array, observation: Array, spec: Spec
+    learner: Learner, key: Array, observation: Data, spec: Spec
 ) -> TrainState:
     """Returns the state before the first update.
 
@@ -74,7 +74,7 @@ def init_train_state(
     )
     batch = jnp.asarray(observation)[None]
     encoder = networks.encoder.init(encoder_key, batch)
-    representation = networks.encoder.apply(encoder, batch)
+    representation = apply(networks.encoder, encoder, batch)
     actor = networks.actor.init(actor_key, representation)
     action = jnp.zeros((1, spec.action_dim))
     critic = networks.critic.init(critic_key, representation, action)
@@ -161,20 +161,20 @@ def _update_critic(
     """
     encoder, actor, critic = learner.networks
     # There is no target encoder: next observations pass through the live one.
-    next_representation = encoder.apply(state.encoder.params, batch.next_observation)
-    next_mean = jnp.tanh(actor.apply(state.actor.params, next_representation))
+    next_representation = apply(encoder, state.encoder.params, batch.next_observation)
+    next_mean = jnp.tanh(apply(actor, state.actor.params, next_representation))
     next_action = distributions.sample_truncated_normal(
         next_mean, std, key, noise_clip=learner.noise_clip
     )
-    next_values = critic.apply(state.target_critic, next_representation, next_action)
+    next_values = apply(critic, state.target_critic, next_representation, next_action)
     target = losses.td_target(batch.reward, batch.discount, next_values)
 
     def loss(params: tuple[Params, Params]) -> tuple[Array, tuple[Array, ...]]:
         encoder_params, critic_params = params
-        representation = encoder.apply(encoder_params, batch.observation)
-        features = critic.apply(critic_params, representation, method=critic.features)
-        values = critic.apply(
-            critic_params, features, batch.action, method=critic.values
+        representation = apply(encoder, encoder_params, batch.observation)
+        features = apply(critic, critic_params, representation, method=critic.features)
+        values = apply(
+            critic, critic_params, features, batch.action, method=critic.values
         )
         return losses.critic_loss(values, target), (representation, features, values)
 
@@ -203,11 +203,11 @@ def _update_actor(
     _, actor, critic = learner.networks
 
     def loss(params: Params) -> tuple[Array, Array]:
-        pre_tanh = actor.apply(params, representation)
+        pre_tanh = apply(actor, params, representation)
         action = distributions.sample_truncated_normal(
             jnp.tanh(pre_tanh), std, key, noise_clip=learner.noise_clip
         )
-        values = critic.apply(state.critic.params, representation, action)
+        values = apply(critic, state.critic.params, representation, action)
         penalty = losses.saturation_penalty(pre_tanh)
         return losses.actor_loss(values) + learner.pre_tanh_penalty * penalty, pre_tanh
 

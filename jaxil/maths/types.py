@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from jax import Array
 
 Params = Any  # a pytree of arrays, as flax makes it
+Data = Any  # an array: NumPy's on the host, jax's inside jitted functions
 Metrics = dict[str, Array]  # scalars, left on the device until they are logged
 
 
@@ -24,11 +25,11 @@ class Batch(NamedTuple):
       next_observation: observation after the window, like `observation`.
     """
 
-    observation: Array
-    action: Array
-    reward: Array
-    discount: Array
-    next_observation: Array
+    observation: Data
+    action: Data
+    reward: Data
+    discount: Data
+    next_observation: Data
 
 
 class ExpertBatch(NamedTuple):
@@ -40,8 +41,8 @@ class ExpertBatch(NamedTuple):
         say that they see actions.
     """
 
-    observation: Array
-    action: Array
+    observation: Data
+    action: Data
 
 
 class Episode(NamedTuple):
@@ -54,9 +55,9 @@ class Episode(NamedTuple):
       task_rewards: the environment's own rewards. Shape [T].
     """
 
-    frames: Array
-    actions: Array
-    task_rewards: Array
+    frames: Data
+    actions: Data
+    task_rewards: Data
 
 
 class ExpertEpisodes(NamedTuple):
@@ -67,5 +68,5 @@ class ExpertEpisodes(NamedTuple):
       actions: shape [K, N, A].
     """
 
-    frames: Array
-    actions: Array
+    frames: Data
+    actions: Data

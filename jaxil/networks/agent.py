@@ -54,6 +54,11 @@ def make_agent_networks(
     )
 
 
+def apply(module: Any, params: Params, *inputs: Any, method: Any = None) -> Array:
+    """Returns what a module computes, as the one array that all of ours return."""
+    return module.apply(params, *inputs, method=method)
+
+
 def actor_features(
     networks: AgentNetworks,
     encoder_params: Params,
@@ -61,12 +66,9 @@ def actor_features(
     observation: Array,
 ) -> Array:
     """Returns trunk features of the actor. [B, H, W, C] to [B, D]."""
-    representation = networks.encoder.apply(encoder_params, observation)
-    features = networks.actor.apply(
-        actor_params, representation, method=networks.actor.features
-    )
-    assert isinstance(features, Array)  # flax types the result as any collection
-    return features
+    representation = apply(networks.encoder, encoder_params, observation)
+    actor = networks.actor
+    return apply(actor, actor_params, representation, method=actor.features)
 
 
 def critic_features(
@@ -76,9 +78,6 @@ def critic_features(
     observation: Array,
 ) -> Array:
     """Returns trunk features of the critic. [B, H, W, C] to [B, D]."""
-    representation = networks.encoder.apply(encoder_params, observation)
-    features = networks.critic.apply(
-        critic_params, representation, method=networks.critic.features
-    )
-    assert isinstance(features, Array)
-    return features
+    representation = apply(networks.encoder, encoder_params, observation)
+    critic = networks.critic
+    return apply(critic, critic_params, representation, method=critic.features)

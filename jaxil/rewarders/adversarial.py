@@ -14,7 +14,7 @@ from jaxil.learner.state import (
 )
 from jaxil.maths import augmentation, losses
 from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes, Metrics, Params
-from jaxil.networks.agent import AgentNetworks, critic_features
+from jaxil.networks.agent import AgentNetworks, apply, critic_features
 from jaxil.networks.discriminator import Discriminator
 from jaxil.rewarders.rewarder import AgentView, Rewarder, Spec
 
@@ -60,9 +60,7 @@ def make_adversarial_rewarder(
         return jnp.concatenate([features, action], axis=-1)
 
     def logits(params: Params, x: Array) -> Array:
-        output = discriminator.apply(params, x)
-        assert isinstance(output, Array)
-        return output
+        return apply(discriminator, params, x)
 
     def init(key: Array, spec: Spec, learner: LearnerParams) -> ModuleState:
         del learner

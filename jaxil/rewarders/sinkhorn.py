@@ -15,8 +15,7 @@ from jaxil.rewarders.rewarder import Rewarder, Spec, keep_state
 _COST_FLOOR = 1e-8  # keeps the scale finite if the first episode costs nothing
 
 
-@struct.dataclass
-class SinkhornState:
+class SinkhornState(struct.PyTreeNode):
     """What P-SIL remembers between episodes.
 
     Attributes:
