@@ -95,6 +95,7 @@ class Run:
         self.checkpoints = Checkpoints(workdir, say=say)
         self.stopwatch = Stopwatch()
         self.metrics: dict[str, Any] = {}
+        self.returns: dict[str, float] = {}  # of the last episode, for people
         self.decisions: list[Decision] = []
         self.stop_asked = False
         self.state: TrainState = self._restore_or_init()
@@ -141,7 +142,7 @@ class Run:
                     counters.last_checkpoint_step, config.checkpoint_every_frames
                 ):
                     self.save()
-            self.progress.update(self.frame, self.stopwatch.seconds)
+            self.progress.update(self.frame, self.stopwatch.seconds, self.returns)
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Returns an exploring action; uniform at first."""
@@ -207,12 +208,16 @@ class Run:
             discounts=episode.discounts,
         )
         self.counters.seconds = time.monotonic() - self.started
+        self.returns = {
+            "task": float(np.sum(episode.task_rewards)),
+            "imitation": float(np.sum(rewards)),
+        }
         self.outputs.episode(
             frame=self.frame,
             seconds=self.counters.seconds,
             episode=self.counters.num_episodes,
-            task_return=float(np.sum(episode.task_rewards)),
-            imitation_return=float(np.sum(rewards)),
+            task_return=self.returns["task"],
+            imitation_return=self.returns["imitation"],
             length=len(rewards),
             reward_seconds=self.stopwatch.reward_seconds,
             metrics=metrics,
@@ -241,7 +246,7 @@ class Run:
             raise TrainingDiverged(
                 f"{', '.join(bad)} became infinite or NaN by frame {self.frame} "
                 f"(update {int(self.state.num_updates)}). Last good checkpoint: "
-                f"{where}. Lower learning_rate, or look at train.csv for what grew before"
+                f"{where}. Lower learning_rate, or see in train.csv what grew before"
             )
 
     def evaluate(self) -> None:

@@ -1,6 +1,7 @@
 """The loop as a tape of events, and what it does about numbers that are not."""
 
 import types
+from typing import Any
 
 import dm_env
 import numpy as np
@@ -41,6 +42,7 @@ class TapeRun(train.Run):
         self.stopwatch = train.Stopwatch()
         self.decisions: list[Decision] = []
         self.tape: list[str] = []
+        self.returns = {}
         self.stop_asked = False
         self.progress = types.SimpleNamespace(update=lambda *_: None)
         self.replay = types.SimpleNamespace(

@@ -103,12 +103,19 @@ def jitted(learner: Learner):
     return jax.jit(make_update_step(learner))
 
 
+def numbers(leaf) -> np.ndarray:
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        leaf = jax.random.key_data(leaf)
+    return np.asarray(leaf)
+
+
 def assert_identical(first, second):
-    jax.tree.map(np.testing.assert_array_equal, first, second)
+    jax.tree.map(np.testing.assert_array_equal, *jax.tree.map(numbers, (first, second)))
 
 
 def any_difference(first, second) -> bool:
-    leaves = jax.tree.map(lambda a, b: bool(jnp.any(a != b)), first, second)
+    first, second = jax.tree.map(numbers, (first, second))
+    leaves = jax.tree.map(lambda a, b: bool(np.any(a != b)), first, second)
     return any(jax.tree.leaves(leaves))
 
 

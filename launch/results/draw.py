@@ -1,0 +1,58 @@
+r"""Draws learning.png from the evaluations beside it: RUN/eval.csv, RUN/config.json.
+
+    python launch/results/draw.py
+"""
+
+import json
+import pathlib
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from jaxil.host.metrics import read_csv
+
+_HERE = pathlib.Path(__file__).parent
+_COLOURS = {"pdac": "#1f6f8b", "psil": "#c8553d", "drqv2": "#588157", "zero": "#777777"}
+_NAMES = {"pdac": "P-DAC", "psil": "P-SIL", "drqv2": "true reward", "zero": "no reward"}
+
+
+def main() -> None:
+    """Draws one panel for each task, one line for each run."""
+    runs: dict[str, list[tuple[dict, dict]]] = {}
+    for path in sorted(_HERE.glob("*/eval.csv")):
+        config = json.loads((path.parent / "config.json").read_text())["config"]
+        runs.setdefault(config["task"], []).append((config, read_csv(path)))
+    figure = Figure(figsize=(4.6 * len(runs), 3.6), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(runs), squeeze=False)[0]
+    for axes, (task, task_runs) in zip(panels, sorted(runs.items()), strict=True):
+        experts = [table["expert_task_return_mean"][-1] for _, table in task_runs]
+        expert = max(experts)
+        axes.axhline(expert, color="#444444", ls="--", lw=1.2, label="expert")
+        axes.axhline(0.8 * expert, color="#444444", ls=":", lw=1.0, label="80 % of it")
+        for config, table in task_runs:
+            axes.plot(
+                table["frame"],
+                table["task_return_mean"],
+                color=_COLOURS[config["method"]],
+                alpha=1.0 if config["seed"] == 0 else 0.55,
+                lw=1.8,
+                marker="o",
+                ms=3,
+                label=f"{_NAMES[config['method']]}, seed {config['seed']}",
+            )
+        axes.set_title(task, loc="left", fontsize=11)
+        axes.set_xlim(left=0)
+        axes.set_ylim(0, 1050)
+        axes.set_xlabel("environment frames")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.grid(axis="y", alpha=0.25, lw=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(frameon=False, fontsize=8)
+    panels[0].set_ylabel("task return, mean of 10 episodes")
+    figure.savefig(_HERE / "learning.png")
+
+
+if __name__ == "__main__":
+    main()
