@@ -11,7 +11,11 @@ runs at some 500 frames per second on one CPU core.
 from jaxil import config as jaxil_config
 
 # Frames until an expert is good enough to be imitated.
-_FRAMES = {"ball_in_cup_catch": 80_000, "cartpole_swingup": 100_000}
+_FRAMES = {
+    "ball_in_cup_catch": 80_000,
+    "cartpole_swingup": 100_000,
+    "walker_walk": 300_000,
+}
 
 
 def get_config(task: str = "cartpole_swingup"):
@@ -23,6 +27,7 @@ def get_config(task: str = "cartpole_swingup"):
     config.update_every_steps = 1
     config.learning_rate = 3e-4
     config.hidden_dim = 256
+    config.num_steps = 3  # on walkers too: rewards travel back faster
     config.exploration_std_steps = 50_000
     # Without it the actor saturates; see `losses.saturation_penalty`.
     config.pre_tanh_penalty = 1e-3

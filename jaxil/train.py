@@ -259,7 +259,8 @@ class Run:
             lambda o: np.asarray(self.agent.exploit(encoder, actor, o)),
             num_episodes=config.num_eval_episodes,
             first_episode=counters.num_evals * config.num_eval_episodes,
-            record_video=every > 0 and counters.num_evals % every == 0,
+            record_video=every > 0
+            and (counters.num_evals % every == 0 or self.frame >= config.total_frames),
         )
         counters.num_evals += 1
         counters.last_eval_step = counters.num_steps

@@ -1,5 +1,7 @@
 """Acting: the mean without noise, and noise whose size follows agent steps."""
 
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,9 @@ import numpy as np
 import optax
 
 from jaxil.learner.policy import make_exploit, make_explore
-from jaxil.networks.agent import make_agent_networks
+from jaxil.networks.agent import apply, make_agent_networks
+
+with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
 
 NETWORKS = make_agent_networks(
     action_dim=3,
@@ -26,23 +30,23 @@ SCHEDULE = optax.linear_schedule(1.0, 0.0, 1000)
 def tiny_params():
     images = np.random.default_rng(0).integers(0, 256, (1, 12, 12, 3), dtype=np.uint8)
     encoder = NETWORKS.encoder.init(jax.random.key(0), images)
-    representation = NETWORKS.encoder.apply(encoder, images)
+    representation = apply(NETWORKS.encoder, encoder, images)
     return encoder, NETWORKS.actor.init(jax.random.key(1), representation), images[0]
 
 
 class ExploitTest(chex.TestCase):
-    @chex.variants(with_jit=True, without_jit=True)
+    @with_and_without_jit
     def test_is_the_tanh_of_the_actors_mean(self):
         encoder, actor, observation = tiny_params()
         action = self.variant(make_exploit(NETWORKS))(encoder, actor, observation)
-        representation = NETWORKS.encoder.apply(encoder, observation[None])
-        mean = np.tanh(NETWORKS.actor.apply(actor, representation))
+        representation = apply(NETWORKS.encoder, encoder, observation[None])
+        mean = np.tanh(apply(NETWORKS.actor, actor, representation))
         assert action.shape == (3,)
         np.testing.assert_allclose(action, mean[0], atol=1e-6)
 
 
 class ExploreTest(chex.TestCase):
-    @chex.variants(with_jit=True, without_jit=True)
+    @with_and_without_jit
     def test_adds_noise_of_the_schedules_size(self):
         encoder, actor, observation = tiny_params()
         mean = make_exploit(NETWORKS)(encoder, actor, observation)

@@ -1,6 +1,7 @@
 """Stacks and shifts against their plain definitions, and against DrQ-v2's own."""
 
 import functools
+from typing import Any
 
 import chex
 import jax
@@ -13,12 +14,14 @@ from hypothesis import strategies as st
 
 from jaxil.maths import augmentation
 
+with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
+
 
 def probe_images(batch, height, width, channels):
     """Images whose every pixel says where it is, the same in all images."""
     image = np.arange(height * width * channels, dtype=np.float32)
     image = image.reshape(height, width, channels)
-    return np.broadcast_to(image, (batch, height, width, channels)).copy()
+    return jnp.asarray(np.broadcast_to(image, (batch, height, width, channels)))
 
 
 def crop(image, corner, padding):
@@ -77,7 +80,7 @@ def bilinear_shift(images, corners, padding):
 
 
 class RandomShiftTest(chex.TestCase):
-    @chex.variants(with_jit=True, without_jit=True)
+    @with_and_without_jit
     @parameterized.parameters(1, 4)
     def test_is_an_edge_padded_crop_with_all_channels_together(self, padding):
         key = jax.random.key(padding)
@@ -93,7 +96,7 @@ class RandomShiftTest(chex.TestCase):
         key = jax.random.key(3)
         images = np.random.default_rng(3).uniform(0, 255, (6, 8, 8, 3))
         images = images.astype(np.float32)
-        ours = augmentation.random_shift(images, key, padding=4)
+        ours = augmentation.random_shift(jnp.asarray(images), key, padding=4)
         theirs = bilinear_shift(images, corners_of(key, 6, 4), 4)
         np.testing.assert_allclose(ours, theirs, atol=2e-3)  # of 255
 
@@ -106,7 +109,7 @@ class RandomShiftTest(chex.TestCase):
 
     @parameterized.parameters(np.uint8, np.float32)
     def test_keeps_shape_and_dtype(self, dtype):
-        images = np.zeros((2, 5, 7, 3), dtype)
+        images = jnp.zeros((2, 5, 7, 3), dtype)
         shifted = augmentation.random_shift(images, jax.random.key(0), padding=2)
         assert shifted.shape == images.shape
         assert shifted.dtype == dtype

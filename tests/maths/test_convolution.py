@@ -1,5 +1,7 @@
 """The matrix form of a convolution against XLA's own, in value and gradient."""
 
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,8 @@ from hypothesis import strategies as st
 from jax import lax
 
 from jaxil.maths import convolution
+
+with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
 
 LAYOUT = ("NHWC", "HWIO", "NHWC")
 
@@ -32,7 +36,7 @@ def ours(images, kernel, strides):
 def draw(seed, images_shape, kernel_shape):
     rng = np.random.default_rng(seed)
     return tuple(
-        rng.normal(size=shape).astype(np.float32)
+        jnp.asarray(rng.normal(size=shape), jnp.float32)
         for shape in (images_shape, kernel_shape)
     )
 
@@ -55,7 +59,7 @@ def assert_same(images, kernel, strides):
 
 
 class ConvolveTest(chex.TestCase):
-    @chex.variants(with_jit=True, without_jit=True)
+    @with_and_without_jit
     @parameterized.parameters(
         (3, 1), (3, 2), (3, 4), (4, 4), (2, 2), (8, 4), (1, 1), (1, 2)
     )
@@ -67,7 +71,7 @@ class ConvolveTest(chex.TestCase):
 
     def test_patches_are_ordered_as_a_kernel_is(self):
         # One window as large as the image: the patch is the image, read in order.
-        images = np.arange(2 * 3 * 4 * 2, dtype=np.float32).reshape(2, 3, 4, 2)
+        images = jnp.arange(2.0 * 3 * 4 * 2).reshape(2, 3, 4, 2)
         for strides in ((3, 4), (1, 2)):  # by reshape, by slices
             patches = convolution.gather_patches(images, (3, 4), strides)
             np.testing.assert_array_equal(patches, images.reshape(2, 1, 1, 24))

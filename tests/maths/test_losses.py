@@ -1,5 +1,7 @@
 """Losses at numbers worked by hand, their gradients, and their extremes."""
 
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -12,9 +14,11 @@ from hypothesis import strategies as st
 
 from jaxil.maths import losses
 
+with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
+
 
 class TdTargetTest(chex.TestCase):
-    @chex.variants(with_jit=True, without_jit=True)
+    @with_and_without_jit
     def test_by_hand(self):
         target = self.variant(losses.td_target)(
             jnp.array([1.0, -1.0, 0.5]),
@@ -40,7 +44,7 @@ class TdTargetTest(chex.TestCase):
 
 
 class CriticLossTest(chex.TestCase):
-    @chex.variants(with_jit=True, without_jit=True)
+    @with_and_without_jit
     def test_by_hand(self):
         values = jnp.array([[1.0, 2.0], [3.0, 5.0]])
         # mean(1, 0) + mean(9, 9)
@@ -58,7 +62,7 @@ class CriticLossTest(chex.TestCase):
 
 
 class ActorLossTest(chex.TestCase):
-    @chex.variants(with_jit=True, without_jit=True)
+    @with_and_without_jit
     def test_by_hand(self):
         values = jnp.array([[1.0, 5.0], [2.0, 3.0]])
         np.testing.assert_allclose(self.variant(losses.actor_loss)(values), -2.0)
@@ -73,7 +77,7 @@ class ActorLossTest(chex.TestCase):
 
 
 class DiscriminatorLossTest(chex.TestCase):
-    @chex.variants(with_jit=True, without_jit=True)
+    @with_and_without_jit
     @parameterized.parameters(
         # D = 1/2 for all: -log(1/2) twice.
         ([0.0, 0.0], [0.0, 0.0], 2.0 * np.log(2.0)),
@@ -123,7 +127,7 @@ def test_discriminator_loss_is_binary_cross_entropy(logits):
 
 
 class GradientPenaltyTest(chex.TestCase):
-    @chex.variants(with_jit=True, without_jit=True)
+    @with_and_without_jit
     @parameterized.parameters(((3.0, 4.0), 16.0), ((0.6, 0.8), 0.0), ((0.0, 0.5), 0.25))
     def test_of_a_linear_discriminator(self, weights, expected):
         # The gradient is w everywhere: (|w| - 1)^2.

@@ -1,6 +1,7 @@
 """Entropic transport: closed forms, marginals, and two independent solvers."""
 
 import functools
+from typing import Any
 
 import chex
 import jax
@@ -14,6 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from jaxil.maths import transport
+
+with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
 
 
 def plan_of(cost, *, epsilon=0.1, num_iterations=200):
@@ -41,7 +44,7 @@ def plain_sinkhorn(cost, epsilon, num_iterations):
 
 
 class CosineCostTest(chex.TestCase):
-    @chex.variants(with_jit=True, without_jit=True)
+    @with_and_without_jit
     def test_at_0_90_and_180_degrees(self):
         x = jnp.array([[2.0, 0.0], [0.0, 0.5]])
         y = jnp.array([[3.0, 0.0], [0.0, 1.0], [-7.0, 0.0]])
@@ -77,7 +80,7 @@ def test_cosine_cost_is_in_range_and_ignores_length(x, factor):
 
 
 class SinkhornPlanTest(chex.TestCase):
-    @chex.variants(with_jit=True, without_jit=True)
+    @with_and_without_jit
     @parameterized.parameters(1.0, 0.1, 0.005)  # the last underflows as exp(-C / e)
     def test_closed_form_of_two_points(self, epsilon):
         # C = [[0, 1], [1, 0]] and k = exp(-1 / epsilon): scaling the kernel by hand
@@ -140,7 +143,7 @@ class SinkhornPlanTest(chex.TestCase):
 
 
 class TransportRewardsTest(chex.TestCase):
-    @chex.variants(with_jit=True, without_jit=True)
+    @with_and_without_jit
     def test_by_hand(self):
         rewards = self.variant(transport.transport_rewards)(
             jnp.array([[1.0, 2.0], [0.0, 4.0]]), jnp.array([[0.5, 0.0], [0.25, 0.25]])

@@ -1,13 +1,17 @@
 """The trunk, the MLP and the actor: sizes by hand, layers by their definitions."""
 
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxil.networks.actor import Actor
-from jaxil.networks.agent import actor_features, make_agent_networks
+from jaxil.networks.agent import actor_features, apply, make_agent_networks
 from jaxil.networks.layers import MLP, Trunk
+
+with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
 
 
 def num_parameters(tree):
@@ -35,7 +39,7 @@ def test_parameters_at_the_papers_size():
 
 
 class TrunkTest(chex.TestCase):
-    @chex.variants(with_jit=True, without_jit=True)
+    @with_and_without_jit
     def test_is_linear_then_layer_norm_then_tanh(self):
         trunk = Trunk(feature_dim=5)
         # Small inputs: their variance is near epsilon, so epsilon is seen.
@@ -63,7 +67,7 @@ class TrunkTest(chex.TestCase):
 
 
 class ActorTest(chex.TestCase):
-    @chex.variants(with_jit=True, without_jit=True)
+    @with_and_without_jit
     def test_head_is_two_relu_layers_and_a_linear_one(self):
         mlp = MLP(hidden_dim=6, output_dim=3)
         x = np.random.default_rng(0).normal(size=(4, 5)).astype(np.float32)
@@ -84,12 +88,12 @@ class ActorTest(chex.TestCase):
         actor = Actor(action_dim=2, feature_dim=5, hidden_dim=6)
         representation = jax.random.normal(jax.random.key(0), (3, 8))
         params = actor.init(jax.random.key(1), representation)
-        features = actor.apply(params, representation, method=actor.features)
+        features = apply(actor, params, representation, method=actor.features)
         assert features.shape == (3, 5)
         head = MLP(6, 2)
-        expected = head.apply({"params": params["params"]["head"]}, features)
+        expected = apply(head, {"params": params["params"]["head"]}, features)
         np.testing.assert_allclose(
-            actor.apply(params, representation), expected, atol=1e-6
+            apply(actor, params, representation), expected, atol=1e-6
         )
 
 
@@ -120,8 +124,8 @@ def test_actor_features_are_the_trunk_on_the_encoder():
     )
     images = np.random.default_rng(0).integers(0, 256, (3, 12, 12, 3), dtype=np.uint8)
     encoder = networks.encoder.init(jax.random.key(0), images)
-    representation = networks.encoder.apply(encoder, images)
+    representation = apply(networks.encoder, encoder, images)
     actor = networks.actor.init(jax.random.key(1), representation)
-    trunk = Trunk(5).apply({"params": actor["params"]["trunk"]}, representation)
+    trunk = apply(Trunk(5), {"params": actor["params"]["trunk"]}, representation)
     features = actor_features(networks, encoder, actor, jnp.asarray(images))
     np.testing.assert_allclose(features, trunk, atol=1e-6)

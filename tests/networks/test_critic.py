@@ -1,14 +1,18 @@
 """The twin critics: sizes by hand, one trunk, two heads, the action after it."""
 
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxil.networks.agent import critic_features, make_agent_networks
+from jaxil.networks.agent import apply, critic_features, make_agent_networks
 from jaxil.networks.critic import Critic
 from jaxil.networks.layers import MLP, Trunk
+
+with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
 
 TINY = Critic(feature_dim=5, hidden_dim=6)
 
@@ -37,39 +41,39 @@ def test_parameters_at_the_papers_size():
 
 
 class CriticTest(chex.TestCase):
-    @chex.variants(with_jit=True, without_jit=True)
+    @with_and_without_jit
     def test_each_value_is_an_mlp_of_features_and_action(self):
         representation, action = inputs()
         params = TINY.init(jax.random.key(1), representation, action)
         layers = params["params"]
-        features = Trunk(5).apply({"params": layers["trunk"]}, representation)
+        features = apply(Trunk(5), {"params": layers["trunk"]}, representation)
         joined = jnp.concatenate([features, action], axis=1)
         values = self.variant(TINY.apply)(params, representation, action)
         assert values.shape == (2, 3)
         for value, name in zip(values, ("value_1", "value_2"), strict=True):
-            expected = MLP(6, 1).apply({"params": layers[name]}, joined)
+            expected = apply(MLP(6, 1), {"params": layers[name]}, joined)
             np.testing.assert_allclose(value, expected[:, 0], atol=1e-6)
 
     def test_heads_start_apart(self):
         representation, action = inputs()
         params = TINY.init(jax.random.key(1), representation, action)
-        first, second = TINY.apply(params, representation, action)
+        first, second = apply(TINY, params, representation, action)
         assert np.abs(first - second).max() > 1e-2
 
     def test_features_then_values_is_the_whole(self):
         representation, action = inputs()
         params = TINY.init(jax.random.key(1), representation, action)
-        features = TINY.apply(params, representation, method=TINY.features)
-        values = TINY.apply(params, features, action, method=TINY.values)
+        features = apply(TINY, params, representation, method=TINY.features)
+        values = apply(TINY, params, features, action, method=TINY.values)
         np.testing.assert_array_equal(
-            values, TINY.apply(params, representation, action)
+            values, apply(TINY, params, representation, action)
         )
 
     def test_rejects_one_action_for_a_batch(self):
         representation, action = inputs()
         params = TINY.init(jax.random.key(1), representation, action)
         with pytest.raises(AssertionError):
-            TINY.apply(params, representation, action[0])
+            apply(TINY, params, representation, action[0])
 
 
 def test_features_of_agent_networks_are_the_critics_and_not_the_actors():
@@ -86,9 +90,9 @@ def test_features_of_agent_networks_are_the_critics_and_not_the_actors():
     )
     images = np.random.default_rng(0).integers(0, 256, (3, 12, 12, 3), dtype=np.uint8)
     encoder = networks.encoder.init(jax.random.key(0), images)
-    representation = networks.encoder.apply(encoder, images)
+    representation = apply(networks.encoder, encoder, images)
     critic = networks.critic.init(jax.random.key(1), representation, jnp.zeros((3, 2)))
-    trunk = Trunk(5).apply({"params": critic["params"]["trunk"]}, representation)
+    trunk = apply(Trunk(5), {"params": critic["params"]["trunk"]}, representation)
     features = critic_features(networks, encoder, critic, jnp.asarray(images))
     np.testing.assert_allclose(features, trunk, atol=1e-6)
 
@@ -108,6 +112,6 @@ def test_state_vectors_go_straight_to_the_trunk():
     vectors = jax.random.normal(jax.random.key(0), (3, 7))
     encoder = networks.encoder.init(jax.random.key(0), vectors)
     critic = networks.critic.init(jax.random.key(1), vectors, jnp.zeros((3, 2)))
-    trunk = Trunk(5).apply({"params": critic["params"]["trunk"]}, vectors)
+    trunk = apply(Trunk(5), {"params": critic["params"]["trunk"]}, vectors)
     features = critic_features(networks, encoder, critic, vectors)
     np.testing.assert_allclose(features, trunk, atol=1e-6)

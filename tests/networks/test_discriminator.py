@@ -1,11 +1,15 @@
 """The discriminator: its size by hand, one logit for each row."""
 
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxil.networks.discriminator import Discriminator
+
+with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
 
 
 def test_parameters_at_the_papers_size():
@@ -18,7 +22,7 @@ def test_parameters_at_the_papers_size():
 
 
 class DiscriminatorTest(chex.TestCase):
-    @chex.variants(with_jit=True, without_jit=True)
+    @with_and_without_jit
     def test_each_row_is_judged_by_itself(self):
         # The gradient penalty relies on it: one gradient of a sum, row by row.
         discriminator = Discriminator(hidden_dim=8)

@@ -11,7 +11,7 @@ import pytest
 
 from jaxil.learner.state import LearnerParams
 from jaxil.maths.types import Episode, ExpertBatch
-from jaxil.networks.agent import critic_features, make_agent_networks
+from jaxil.networks.agent import apply, critic_features, make_agent_networks
 from jaxil.networks.discriminator import Discriminator
 from jaxil.rewarders.adversarial import make_adversarial_rewarder
 from jaxil.rewarders.rewarder import AgentView, Spec
@@ -53,7 +53,7 @@ def make_params(seed, frame_stack=1):
     keys = jax.random.split(jax.random.key(seed), 3)
     images = jnp.zeros((1, SIDE, SIDE, 3 * frame_stack), jnp.uint8)
     encoder = NETWORKS.encoder.init(keys[0], images)
-    z = NETWORKS.encoder.apply(encoder, images)
+    z = apply(NETWORKS.encoder, encoder, images)
     actor = NETWORKS.actor.init(keys[1], z)
     critic = NETWORKS.critic.init(keys[2], z, jnp.zeros((1, 2)))
     return LearnerParams(encoder, actor, critic)
@@ -74,7 +74,7 @@ def make_view(params, frames, actions=None):
         NETWORKS, params.encoder, params.critic, jnp.asarray(frames)
     )
     actions = random_actions(9, len(frames)) if actions is None else actions
-    return AgentView(frames, features, actions)
+    return AgentView(jnp.asarray(frames), features, jnp.asarray(actions))
 
 
 def rewards_of(rewarder, params, frames, actions=None, seed=0):
@@ -139,7 +139,7 @@ def test_the_reward_is_the_logit_of_critic_features():
     features = critic_features(
         NETWORKS, params.encoder, params.critic, jnp.asarray(frames[1:])
     )
-    expected = Discriminator(16).apply(state.params, features)
+    expected = apply(Discriminator(16), state.params, features)
     np.testing.assert_allclose(
         rewards_of(rewarder, params, frames), expected, atol=1e-5
     )
@@ -220,7 +220,7 @@ def test_a_step_descends_cross_entropy_and_penalty(sees_actions):
 
     def loss(weights):
         def logit(x):
-            return discriminator.apply(weights, x[None])[0]
+            return apply(discriminator, weights, x[None])[0]
 
         expert_term = jax.nn.sigmoid(jax.vmap(logit)(expert_inputs))
         agent_term = jax.nn.sigmoid(jax.vmap(logit)(agent_inputs))

@@ -1,6 +1,7 @@
 """The rewarders without demonstrations."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -26,7 +27,7 @@ def test_rewards_need_no_demonstrations(rewarder, expected):
     rewards, after = rewarder.rewards(state, NOTHING, episode, None)
     np.testing.assert_array_equal(rewards, expected)
     assert after == state
-    view = AgentView(np.zeros((2, 5)), np.zeros((2, 2)), np.zeros((2, 1)))
+    view = AgentView(jnp.zeros((2, 5)), jnp.zeros((2, 2)), jnp.zeros((2, 1)))
     assert rewarder.update(state, NOTHING, view, None, jax.random.key(0)) == (state, {})
     assert not rewarder.samples_expert
     assert not rewarder.matches_episodes
