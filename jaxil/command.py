@@ -102,6 +102,9 @@ def run(main: Callable[[list[str]], int | None]) -> None:
     except KeyboardInterrupt:
         print("\ninterrupted", file=sys.stderr)
         status = 130
+    except BrokenPipeError:  # `... | head` has read enough
+        sys.stdout = None
+        status = 0
     sys.exit(status)
 
 

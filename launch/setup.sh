@@ -16,6 +16,8 @@ gl_packages=(libegl1 libgl1-mesa-dri libosmesa6)
 ready_file=$venv/jaxil-ready           # lines "DIGEST EXTRAS": what .venv holds whole
 unfinished_file=$venv/jaxil-unfinished # there only while .venv is being changed
 log_file=$venv/jaxil-setup.log
+# Gigabytes with a GPU, too many for some machines' /tmp, and left behind by a kill.
+scratch=$venv/jaxil-scratch
 python=
 child=
 
@@ -56,6 +58,7 @@ set_up() { # EXTRAS
 stop() { # STATUS
   [[ -z $child ]] || kill "$child" 2>/dev/null || true
   wait
+  rm -rf "$scratch" || true
   fail "$1" "Set-up cut off; the same command begins it again."
 }
 
@@ -196,8 +199,11 @@ install_project() { # EXTRAS
     run_logged "$python" -m ensurepip
   fi
   python=$venv/bin/python
-  run_logged env PIP_USER=0 "$python" -m pip install --no-input --progress-bar off \
-    --disable-pip-version-check -c launch/constraints.txt -e "$project"
+  mkdir -p "$scratch"
+  run_logged env PIP_USER=0 TMPDIR="$scratch" "$python" -m pip install \
+    --no-input --progress-bar off --disable-pip-version-check \
+    -c launch/constraints.txt -e "$project"
+  rm -rf "$scratch"
   stamp=$(digest)
   {
     grep -s "^$stamp " "$ready_file" || true # other extras, at the same versions
@@ -215,7 +221,7 @@ run_logged() { # COMMAND...
   child=$!
   wait "$child" || {
     # It ended by itself and undid what it had begun: no need to begin from nothing.
-    rm -f "$unfinished_file"
+    rm -rf "$unfinished_file" "$scratch"
     show_log
     fail 1 "Set-up failed, see above; all of it is in $log_file."
   }
