@@ -121,7 +121,7 @@ def measure(config: Any, *, repeats: int, steps: int) -> dict[str, Any]:
         before = dict(run.stopwatch.seconds)
         start = time.perf_counter()
         run.loop()
-        # The last update may still be computed in the background: it is an update's time.
+        # The last update may still run in the background: it is an update's time.
         run.stopwatch.timed("update", jax.block_until_ready)(run.state.num_updates)
         wall = time.perf_counter() - start
         working = sum(run.stopwatch.seconds.values()) - sum(before.values())

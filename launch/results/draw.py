@@ -1,6 +1,6 @@
 r"""Draws learning.png from the evaluations beside it: RUN/eval.csv, RUN/config.json.
 
-    python launch/results/draw.py
+python launch/results/draw.py
 """
 
 import json

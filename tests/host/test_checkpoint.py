@@ -277,7 +277,7 @@ def test_a_damaged_newest_checkpoint_falls_back(tmp_path, seed):
     add_episodes(restored, 1, num_steps=3)
     save(survivor, 2, restored)
     again = make_replay()
-    assert Checkpoints(tmp_path, say=said.append).restore(ABSTRACT, again)
+    Checkpoints(tmp_path, say=said.append).restore(ABSTRACT, again)
     assert_same_replay(restored, again)
     assert len(said) == 1
 

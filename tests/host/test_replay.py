@@ -156,11 +156,15 @@ def test_three_step_return_by_hand():
 
     # gamma 0.5: 1 + (0.5 * 1) * 2 + (0.5 * 1) * (0.5 * 0.5) * 4 = 1 + 1 + 0.5. The last
     # discount, 0, only concerns what follows: 0.5 * 0.25 * (0.5 * 0) = 0.
-    np.testing.assert_array_equal(batch.reward, np.float32([2.5, 2.5]))
-    np.testing.assert_array_equal(batch.discount, np.float32([0, 0]))
-    np.testing.assert_array_equal(batch.observation, np.float32([[0], [0]]))
-    np.testing.assert_array_equal(batch.next_observation, np.float32([[3], [3]]))
-    np.testing.assert_array_equal(batch.action, np.float32([[10, 0], [10, 0]]))
+    np.testing.assert_array_equal(batch.reward, np.array([2.5, 2.5], np.float32))
+    np.testing.assert_array_equal(batch.discount, np.array([0, 0], np.float32))
+    np.testing.assert_array_equal(batch.observation, np.array([[0], [0]], np.float32))
+    np.testing.assert_array_equal(
+        batch.next_observation, np.array([[3], [3]], np.float32)
+    )
+    np.testing.assert_array_equal(
+        batch.action, np.array([[10, 0], [10, 0]], np.float32)
+    )
 
 
 def test_a_time_limit_keeps_the_bootstrap():
@@ -170,7 +174,8 @@ def test_a_time_limit_keeps_the_bootstrap():
 
     batch = replay.sample(np.random.default_rng(0), 1)
 
-    np.testing.assert_array_equal(batch.discount, np.float32([0.25]))  # gamma squared
+    # Gamma squared.
+    np.testing.assert_array_equal(batch.discount, np.array([0.25], np.float32))
 
 
 def test_stacks_repeat_the_first_frame_and_are_contiguous():
