@@ -73,6 +73,9 @@ def make_experts(seed=50):
     )
 
 
+solve = jax.jit(closest_rewards, static_argnames=("epsilon", "num_iterations"))
+
+
 def start(rewarder, params):
     return rewarder.init(jax.random.key(0), SPEC, params)
 
@@ -92,9 +95,6 @@ def first_rewards(params, frames, experts=None, frame_stack=1):
 def test_rewards_are_those_of_the_best_assignment():
     # Few points, little entropy and many iterations: the plan is a permutation, if
     # the second best costs clearly more.
-    solve = jax.jit(
-        functools.partial(closest_rewards, epsilon=0.005, num_iterations=3000)
-    )
     solved = 0
     for seed in range(20):
         cost = np.random.default_rng(seed).uniform(0, 2, (4, 4)).astype(np.float32)
@@ -104,7 +104,7 @@ def test_rewards_are_those_of_the_best_assignment():
         )
         if totals[1] - totals[0] > 0.2:
             rows, columns = scipy.optimize.linear_sum_assignment(cost)
-            rewards = solve(jnp.asarray(cost[None]))
+            rewards = solve(jnp.asarray(cost[None]), epsilon=0.005, num_iterations=3000)
             np.testing.assert_allclose(rewards, -cost[rows, columns] / 4, atol=1e-3)
             solved += 1
     assert solved >= 5
@@ -114,9 +114,7 @@ def test_the_cheapest_demonstration_is_chosen():
     levels = np.array([1.5, 0.5, 1.0], np.float32)[:, None, None]
     costs = np.broadcast_to(levels, (3, 4, 2))
     for order in ([0, 1, 2], [1, 2, 0], [2, 0, 1]):
-        rewards = closest_rewards(
-            jnp.asarray(costs[order]), epsilon=0.01, num_iterations=20
-        )
+        rewards = solve(jnp.asarray(costs[order]), epsilon=0.01, num_iterations=20)
         np.testing.assert_allclose(rewards, np.full(4, -0.5 / 4), rtol=1e-5)
 
 
@@ -125,7 +123,7 @@ def test_demonstrations_are_compared_by_cost_and_not_by_entropy():
     # entropy whatever it costs. Costs alone: 0.4 against 0.5.
     sharp = 0.4 + 4.0 * (1.0 - np.eye(4, dtype=np.float32))
     flat = np.full((4, 4), 0.5, np.float32)
-    rewards = closest_rewards(
+    rewards = solve(
         jnp.asarray(np.stack([sharp, flat])), epsilon=0.5, num_iterations=200
     )
     np.testing.assert_allclose(rewards.sum(), -0.4, atol=0.02)
