@@ -2,7 +2,6 @@
 
 import dataclasses
 import pathlib
-import signal
 import sys
 import time
 from collections.abc import Callable
@@ -18,6 +17,8 @@ from jaxil.host.checkpoint import Checkpoints
 from jaxil.host.evaluation import evaluate
 from jaxil.host.interaction import Decision, FinishedEpisode, interact, join
 from jaxil.host.progress import ProgressLine
+from jaxil.host.signals import StopOnSignals
+from jaxil.host.stopwatch import Stopwatch, TimedEnvironment
 from jaxil.learner.state import TrainState
 from jaxil.maths.types import Batch, Episode, ExpertBatch
 
@@ -50,26 +51,6 @@ class Counters:
     last_eval_step: int = 0
     last_checkpoint_step: int = 0
     seconds: float = 0.0
-
-
-class Stopwatch:
-    """Adds up where the time goes."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {"environment": 0.0, "update": 0.0}
-        self.reward_seconds = 0.0
-
-    def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Returns `function`, its time added to `name`."""
-
-        def call(*args: Any, **kwargs: Any) -> Any:
-            start = time.perf_counter()
-            try:
-                return function(*args, **kwargs)
-            finally:
-                self.seconds[name] += time.perf_counter() - start
-
-        return call
 
 
 class Run:
@@ -119,7 +100,7 @@ class Run:
         """
         config, counters = self.config, self.counters
         decisions = interact(
-            _TimedEnvironment(self.environment, self.stopwatch),
+            TimedEnvironment(self.environment, self.stopwatch),
             self.stopwatch.timed("update", self.act),
             first_episode=counters.num_episodes,
         )
@@ -143,6 +124,14 @@ class Run:
                 ):
                     self.save()
             self.progress.update(self.frame, self.stopwatch.seconds, self.returns)
+
+    def ask_to_stop(self, who: str) -> bool:
+        """Makes the loop end after this decision; False if it was asked before."""
+        if self.stop_asked:
+            return False
+        self.stop_asked = True
+        self.progress.message(f"{who}: saving; once more ends at once, unsaved")
+        return True
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Returns an exploring action; uniform at first."""
@@ -313,15 +302,6 @@ class Run:
         return state
 
 
-class _TimedEnvironment:
-    """The environment, its time added up."""
-
-    def __init__(self, environment: Any, stopwatch: Stopwatch) -> None:
-        self.reset = stopwatch.timed("environment", environment.reset)
-        self.step = stopwatch.timed("environment", environment.step)
-        self.single_observation = environment.single_observation
-
-
 def train(config: Config, workdir: pathlib.Path) -> bool:
     """Trains a run to its end, or on to its end.
 
@@ -344,34 +324,9 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
     say(f"{config.task}: {METHODS[config.method]}, seed {config.seed}")
     run = Run(config, workdir, demonstrations, say)
     run.say = run.progress.message
-    with _stopping_on_signals(run):
+    with StopOnSignals(run.ask_to_stop):
         run.loop()
         run.finish()
     if run.stop_asked:
         say(f"stopped at frame {run.frame}, saved; the same command goes on from there")
     return not run.stop_asked
-
-
-class _stopping_on_signals:
-    """Turns the first Ctrl-C or SIGTERM into a request, the second into an end."""
-
-    def __init__(self, run: Run) -> None:
-        self._run = run
-
-    def __enter__(self) -> None:
-        self._before = {
-            number: signal.signal(number, self._ask)
-            for number in (signal.SIGINT, signal.SIGTERM)
-        }
-
-    def __exit__(self, *_: Any) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _ask(self, number: int, frame: Any) -> None:
-        del frame
-        if self._run.stop_asked:
-            raise KeyboardInterrupt
-        self._run.stop_asked = True
-        name = "Ctrl-C" if number == signal.SIGINT else "SIGTERM"
-        self._run.progress.message(f"{name}: saving; once more ends at once, unsaved")

@@ -1,0 +1,34 @@
+"""Where a run's time goes."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+
+class Stopwatch:
+    """Adds up where the time goes."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {"environment": 0.0, "update": 0.0}
+        self.reward_seconds = 0.0
+
+    def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Returns `function`, its time added to `name`."""
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            start = time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self.seconds[name] += time.perf_counter() - start
+
+        return call
+
+
+class TimedEnvironment:
+    """An environment whose resets and steps are added up as "environment"."""
+
+    def __init__(self, environment: Any, stopwatch: Stopwatch) -> None:
+        self.reset = stopwatch.timed("environment", environment.reset)
+        self.step = stopwatch.timed("environment", environment.step)
+        self.single_observation = environment.single_observation
