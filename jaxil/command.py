@@ -147,11 +147,20 @@ def _culprit(arguments: list[str], error: Exception) -> str | None:
         name = word.lstrip("-").split("=")[0]
         if isinstance(error, AttributeError | KeyError):
             parts = name.split(".")
-            if parts[0] == "config" and text.strip("'\"") in parts[1:]:
+            if parts[0] == "config" and _missing_field(error) in parts[1:]:
                 return word
         elif name and (f"--{name}=" in text or f"'{name}'" in text):
             return word
     return None
+
+
+def _missing_field(error: Exception) -> str:
+    """Returns the field that ml_collections did not find, from its error."""
+    inner: Any = error
+    while isinstance(inner, Exception):  # one error may hold another
+        inner = inner.args[0] if inner.args else ""
+    # A second line may guess what was meant; the message has its own guess.
+    return str(inner).split("\n")[0].strip("'\"")
 
 
 def _sentence(culprit: str | None, error: Exception, values: flags.FlagValues) -> str:

@@ -25,6 +25,8 @@ RENDER_QUALITIES = ("paper", "fast")
 _EASY_TASKS = ("cartpole_swingup", "finger_spin", "ball_in_cup_catch")
 _EASY_FRAMES, _HARD_FRAMES = 1_500_000, 5_000_000
 
+_SHORT_LIST = 12  # names that a message may list in full
+
 
 def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Config:
     """Returns the paper's settings for a method on a task.
@@ -134,11 +136,12 @@ def problems(config: Config, known_tasks: tuple[str, ...]) -> list[str]:
 
 def unknown_name(field: str, value: object, known: tuple[str, ...]) -> str:
     """Returns a sentence about a name that does not exist, with the closest ones."""
+    if len(known) <= _SHORT_LIST:
+        return f"{field}={value!r} is unknown; choose one of: {', '.join(known)}"
     close = difflib.get_close_matches(str(value), known, n=3, cutoff=0.5)
-    shown = close or (known if len(known) <= 12 else known[:12])
-    more = "" if len(shown) == len(known) or close else ", ..."
+    shown = ", ".join(close) if close else f"{', '.join(known[:_SHORT_LIST])}, ..."
     hint = "did you mean" if close else "choose one of"
-    return f"{field}={value!r} is unknown; {hint}: {', '.join(shown)}{more}"
+    return f"{field}={value!r} is unknown; {hint}: {shown}"
 
 
 # field: (smallest, largest, why or way out)

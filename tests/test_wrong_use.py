@@ -13,7 +13,7 @@ _TASKS = ("walker_walk", "cartpole_swingup")
 # (field, value, what the sentence must name)
 _BAD_VALUES = (
     ("method", "gail", ("gail", "psil")),
-    ("task", "walker_wlak", ("walker_wlak", "did you mean", "walker_walk")),
+    ("task", "walker_wlak", ("walker_wlak", "walker_walk")),
     ("observation", "pixel", ("pixels",)),
     ("render_quality", "best", ("paper", "fast")),
     ("batch_size", 0, ("batch_size=0", "256 in the paper")),
