@@ -14,6 +14,7 @@ from jaxil.host.metrics import read_csv
 
 _HERE = pathlib.Path(__file__).parent
 _COLOURS = {"pdac": "#1f6f8b", "psil": "#c8553d", "drqv2": "#588157", "zero": "#777777"}
+_STYLES = {2: "-", 4: "--", 8: "-."}  # by action repeat
 _NAMES = {"pdac": "P-DAC", "psil": "P-SIL", "drqv2": "true reward", "zero": "no reward"}
 
 
@@ -23,7 +24,7 @@ def main() -> None:
     for path in sorted(_HERE.glob("*/eval.csv")):
         config = json.loads((path.parent / "config.json").read_text())["config"]
         runs.setdefault(config["task"], []).append((config, read_csv(path)))
-    figure = Figure(figsize=(4.6 * len(runs), 3.6), dpi=150, layout="constrained")
+    figure = Figure(figsize=(5.2 * len(runs), 4.6), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, len(runs), squeeze=False)[0]
     for axes, (task, task_runs) in zip(panels, sorted(runs.items()), strict=True):
@@ -37,10 +38,12 @@ def main() -> None:
                 table["task_return_mean"],
                 color=_COLOURS[config["method"]],
                 alpha=1.0 if config["seed"] == 0 else 0.55,
-                lw=1.8,
+                ls=_STYLES[config["action_repeat"]],
+                lw=1.6,
                 marker="o",
-                ms=3,
-                label=f"{_NAMES[config['method']]}, seed {config['seed']}",
+                ms=2.5,
+                label=f"{_NAMES[config['method']]}, repeat {config['action_repeat']}, "
+                f"seed {config['seed']}",
             )
         axes.set_title(task, loc="left", fontsize=11)
         axes.set_xlim(left=0)
@@ -49,7 +52,13 @@ def main() -> None:
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.grid(axis="y", alpha=0.25, lw=0.6)
         axes.spines[["top", "right"]].set_visible(False)
-        axes.legend(frameon=False, fontsize=8)
+        axes.legend(
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.16),
+            ncols=2,
+            frameon=False,
+            fontsize=8,
+        )
     panels[0].set_ylabel("task return, mean of 10 episodes")
     figure.savefig(_HERE / "learning.png")
 
