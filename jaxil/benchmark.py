@@ -120,7 +120,7 @@ def measure(config: Any, *, repeats: int, steps: int) -> dict[str, Any]:
         parts["update_ms"] -= parts["sample_ms"]
         before = dict(run.stopwatch.seconds)
         start = time.perf_counter()
-        run.loop()
+        run.loop(whole_episodes=False)
         # The last update may still run in the background: it is an update's time.
         run.stopwatch.timed("update", jax.block_until_ready)(run.state.num_updates)
         wall = time.perf_counter() - start

@@ -94,10 +94,14 @@ class Run:
         """Environment frames so far."""
         return self.counters.num_steps * self.config.action_repeat
 
-    def loop(self) -> None:
+    def loop(self, *, whole_episodes: bool = True) -> None:
         """Trains until the budget is used up, or until someone asks to stop.
 
         `finish` has to follow.
+
+        Args:
+          whole_episodes: whether an episode that is under way when the budget ends is
+            played to its end, so that it counts and the last evaluation takes place.
         """
         config, counters = self.config, self.counters
         decisions = interact(
@@ -105,7 +109,9 @@ class Run:
             self.stopwatch.timed("update", self.act),
             first_episode=counters.num_episodes,
         )
-        while self.frame < config.total_frames and not self.stop_asked:
+        while not self.stop_asked and (
+            self.frame < config.total_frames or (whole_episodes and self.decisions)
+        ):
             # Act and observe.
             decision = next(decisions)
             counters.num_steps += 1

@@ -113,6 +113,19 @@ def test_no_update_before_the_seed_frames_or_without_experience():
     assert "update" not in run.tape  # the first episode enters at its end only
 
 
+def test_the_budget_ends_with_an_episode_and_an_evaluation():
+    # After a Ctrl-C, episodes no longer end at multiples of the budget.
+    run = TapeRun(_config(total_frames=8, eval_every_frames=100))
+    run.loop()
+    assert run.counters.num_steps == 6
+    assert run.tape[-3:] == ["store [10, 11, 12, 13]", "evaluate", "save"]
+    run.loop()
+    assert run.counters.num_steps == 6  # nothing is left to do
+    run = TapeRun(_config(total_frames=8))
+    run.loop(whole_episodes=False)
+    assert run.counters.num_steps == 4
+
+
 def test_a_stop_is_heeded_at_once():
     run = TapeRun(_config())
     act, run_act = [], run.act

@@ -24,6 +24,7 @@ import numpy as np
 
 from jaxil.host import archive, rendering
 from jaxil.host import environment as environments
+from jaxil.host.stacking import gather_stacks
 
 FORMAT = "jaxil-demonstrations"
 VERSION = 1
@@ -314,11 +315,12 @@ def sample(
     num_episodes, num_steps = demonstrations.actions.shape[:2]
     episodes = rng.integers(num_episodes, size=batch_size)
     steps = rng.integers(num_steps, size=batch_size)
-    stack = [
-        demonstrations.frames[episodes, np.maximum(steps - age, 0)]
-        for age in range(frame_stack - 1, -1, -1)
-    ]
-    return np.concatenate(stack, axis=-1), demonstrations.actions[episodes, steps]
+    # As one long row of frames, without a copy, from which stacks are gathered.
+    frames = demonstrations.frames.reshape(-1, *demonstrations.frames.shape[2:])
+    ages = np.arange(frame_stack - 1, -1, -1)
+    times = np.maximum(steps[:, None] - ages, 0)
+    indices = episodes[:, None] * (num_steps + 1) + times
+    return gather_stacks(frames, indices), demonstrations.actions[episodes, steps]
 
 
 def _shipped_folder() -> pathlib.Path:

@@ -397,3 +397,22 @@ def test_every_shipped_file_can_be_shown(task):
     )
     assert frames.std() > 1.0
     demonstrations.check("", task=task, num_episodes=10, action_repeat=2)
+
+
+def test_sampled_stacks_are_those_of_an_episode_with_the_actions_taken_there():
+    frames = np.arange(2 * 4, dtype=np.uint8).reshape(2, 4, 1, 1, 1)
+    frames = np.repeat(frames, 3, axis=-1)  # episode e, time t holds 4 e + t
+    actions = np.arange(2 * 3, dtype=np.float32).reshape(2, 3, 1)
+    demos = demonstrations.Demonstrations(frames, actions, actions[..., 0], {})
+    observation, action = demonstrations.sample(
+        demos, np.random.default_rng(0), 200, frame_stack=3
+    )
+    expected = {
+        float(actions[e, t, 0]): [4 * e + max(t - age, 0) for age in (2, 1, 0)]
+        for e in range(2)
+        for t in range(3)
+    }
+    assert set(action[:, 0].tolist()) == set(expected)
+    for stack, taken in zip(observation, action[:, 0].tolist(), strict=True):
+        assert stack.shape == (1, 1, 9)
+        assert stack[0, 0, ::3].tolist() == expected[taken]
