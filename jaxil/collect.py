@@ -1,11 +1,18 @@
-r"""Records demonstrations of the best of some trained experts.
+r"""Records, shows and converts demonstrations.
 
     python -m jaxil.collect --workdirs=runs/expert0,runs/expert1 \
-        --output=jaxil/demonstrations/cartpole_swingup.npz --num_episodes=50
+        --output=cartpole_swingup.npz --num_episodes=50
 
-Each run's policy is evaluated by its mean action; the best one plays the episodes.
-The file holds simulator states, not pixels: whoever trains renders them as their agent
-sees.
+evaluates the policies of one or several runs by their mean actions; the best one plays
+the episodes. The file holds simulator states, not pixels: whoever trains renders them
+as their agent sees.
+
+    python -m jaxil.collect --inspect=FILE
+    python -m jaxil.collect --convert=IN --output=OUT.npz
+
+print what a file of any format holds, with a contact sheet and a video, and write it as
+jaxil's own file of pixels. Formats: jaxil states or pixels, ROT or PatchAIL pickles,
+folders of DrQ-v2 or V-D4RL episodes, videos, Minari and LeRobot v3 datasets.
 """
 
 import pathlib
@@ -18,23 +25,43 @@ from jaxil import command
 _NUM_EVAL_EPISODES = 10
 # The recording environment's seed: shared by no training and no evaluation.
 _SEED = 777
+# Height and width of what is drawn from states, unless --image_size says otherwise.
+_INSPECTED_SIZE, _CONVERTED_SIZE = 160, 84
+_JOBS = ("workdirs", "inspect", "convert")
 
 
 def main(argv: list[str]) -> None:
     """Runs the command."""
-    values = command.parse(argv, __doc__ or "", _define)
-    missing = [
-        f"--{n} is missing" for n in ("workdirs", "output") if not values[n].value
-    ]
-    if missing:
-        raise command.UsageError(command.listing(missing))
+    values = command.parse(_named_output(argv), __doc__ or "", _define)
+    jobs = [name for name in _JOBS if values[name].value]
+    faults = []
+    if len(jobs) != 1:
+        names = ", ".join(f"--{name}" for name in _JOBS)
+        given = ", ".join(f"--{name}" for name in jobs) or "none"
+        faults.append(f"exactly one of {names} is needed, and given: {given}")
+    if "inspect" not in jobs and values.output is None:
+        faults.append("--output is missing: name the file to write, NAME.npz")
+    if values.output is not None and pathlib.Path(values.output).is_dir():
+        if "inspect" not in jobs:
+            faults.append(
+                f"--output={values.output} is a folder: name a file, NAME.npz"
+            )
+    elif "inspect" in jobs and values.output is not None:
+        faults.append(f"--output={values.output} must be a folder that exists")
+    if faults:
+        raise command.UsageError(command.listing(faults))
     from jaxil import platform
 
     print(platform.prepare(), file=sys.stderr, flush=True)
+    {"workdirs": _record, "inspect": _inspect, "convert": _convert}[jobs[0]](values)
+
+
+def _record(values: flags.FlagValues) -> None:
+    """Records the best of several policies."""
     import numpy as np
 
     from jaxil import recording, trained
-    from jaxil.host import demonstrations
+    from jaxil.host import states
     from jaxil.host.evaluation import evaluate
 
     runs = [trained.load(pathlib.Path(folder)) for folder in values.workdirs]
@@ -45,19 +72,24 @@ def main(argv: list[str]) -> None:
             "seeds of one task"
         )
     means = []
+    print(f"{'mean':>8}{'std':>8}{'frames':>10}{'minutes':>9}  run")
     for folder, run in zip(values.workdirs, runs, strict=True):
         evaluation = evaluate(
             run.environment, run.act, num_episodes=_NUM_EVAL_EPISODES, first_episode=0
         )
         means.append(evaluation.mean)
-        print(f"{folder}: mean {evaluation.mean:.1f}, std {evaluation.std:.1f}")
+        print(
+            f"{evaluation.mean:>8.1f}{evaluation.std:>8.1f}{run.frame:>10}"
+            f"{run.seconds / 60:>9.0f}  {folder}",
+            flush=True,
+        )
     best = int(np.argmax(means))
-    states = recording.record(runs[best], num_episodes=values.num_episodes, seed=_SEED)
+    stored = recording.record(runs[best], num_episodes=values.num_episodes, seed=_SEED)
     try:
-        demonstrations.write_states(values.output, states)
-    except (OSError, demonstrations.DemonstrationError) as error:
+        states.write_states(values.output, stored)
+    except (OSError, states.DemonstrationError) as error:
         raise command.UsageError(f"--output={values.output}: {error}") from error
-    returns = states.rewards.sum(axis=1)
+    returns = stored.rewards.sum(axis=1)
     size = pathlib.Path(values.output).stat().st_size / 1e6
     print(
         f"{values.output}: {len(returns)} episodes of {values.workdirs[best]}, return "
@@ -66,18 +98,148 @@ def main(argv: list[str]) -> None:
     )
 
 
+def _inspect(values: flags.FlagValues) -> None:
+    """Prints a summary; writes a contact sheet and a video."""
+    from jaxil import inspection
+    from jaxil.host.readers.recording import FormatError
+    from jaxil.host.states import DemonstrationError
+    from jaxil.host.video import write_video
+
+    path = pathlib.Path(values.inspect)
+    try:
+        seen = inspection.inspect(
+            path,
+            image_size=values.image_size or _INSPECTED_SIZE,
+            render_quality=values.render_quality,
+            max_bytes=_max_bytes(),
+        )
+    except DemonstrationError as error:
+        raise command.UsageError(str(error)) from error
+    except FormatError as error:
+        raise command.UsageError(f"{path} {error}.") from error
+    except OSError as error:
+        raise command.UsageError(
+            f"--inspect={path} cannot be read ({error.strerror or error})"
+        ) from error
+    print(inspection.table(seen))
+    name = path.resolve().stem
+    folder = pathlib.Path(values.output or ".")
+    sheet, video = folder / f"{name}_sheet.png", folder / f"{name}.mp4"
+    try:
+        temporary = sheet.with_suffix(".part")
+        inspection.contact_sheet(seen).save(temporary, format="png")
+        temporary.replace(sheet)
+        write_video(video, seen.video, fps=seen.frames_per_second, labels=(name, ""))
+    except OSError as error:
+        raise command.UsageError(f"--output={folder}: {error}") from error
+    print(f"contact sheet: {sheet}\nvideo of episode 0: {video}")
+
+
+def _convert(values: flags.FlagValues) -> None:
+    """Writes a file of any format as jaxil's own file of pixels."""
+    from jaxil import inspection
+    from jaxil.host import foreign, states
+    from jaxil.host.readers import own
+    from jaxil.host.readers.recording import FormatError
+
+    path, output = pathlib.Path(values.convert), pathlib.Path(values.output)
+    try:
+        if states.recognises(path):
+            recording = inspection.render_recording(
+                path,
+                image_size=values.image_size or _CONVERTED_SIZE,
+                render_quality=values.render_quality,
+            )
+        else:
+            recording = foreign.open_recording(
+                path, max_bytes=_max_bytes(), frame_skip=values.frame_skip
+            )
+            if values.image_size is not None:
+                recording = foreign.of_size(recording, values.image_size)
+        own.write_pixels(output, recording, origin=f"{recording.kind}, {path.name}")
+    except states.DemonstrationError as error:
+        raise command.UsageError(str(error)) from error
+    except FormatError as error:
+        raise command.UsageError(f"{path} {error}.") from error
+    except OSError as error:
+        raise command.UsageError(
+            f"--convert={path} --output={output}: {error}"
+        ) from error
+    size = output.stat().st_size / 1e6
+    print(
+        f"{output}: {recording.num_episodes} episodes of {recording.kind}, "
+        f"{size:.2f} MB"
+    )
+
+
+def _named_output(argv: list[str]) -> list[str]:
+    """Lets people write `--convert IN OUT` for `--convert=IN --output=OUT`."""
+    if "--convert" not in argv:
+        return argv
+    place = argv.index("--convert")
+    words = argv[place + 1 : place + 3]
+    if len(words) < 2 or any(word.startswith("-") for word in words):
+        return argv
+    named = [f"--convert={words[0]}", f"--output={words[1]}"]
+    return [*argv[:place], *named, *argv[place + 3 :]]
+
+
+def _max_bytes() -> int:
+    """Returns how much memory one array of a file may take."""
+    from jaxil import experiment
+
+    return experiment.spare_bytes()
+
+
 def _define(values: flags.FlagValues) -> None:
     flags.DEFINE_list(
         "workdirs",
         [],
-        "folders of runs of one task, comma-separated",
+        "folders of runs of one task, comma-separated, to record the best of",
         flag_values=values,
     )
-    flags.DEFINE_string("output", None, "file to write, NAME.npz", flag_values=values)
+    flags.DEFINE_string(
+        "inspect", None, "file or folder to show, of any format", flag_values=values
+    )
+    flags.DEFINE_string(
+        "convert",
+        None,
+        "file or folder of any format to write as pixels; also --convert IN OUT",
+        flag_values=values,
+    )
+    flags.DEFINE_string(
+        "output",
+        None,
+        "file to write, NAME.npz; with --inspect the folder for sheet and video",
+        flag_values=values,
+    )
     flags.DEFINE_integer(
         "num_episodes",
         50,
         "episodes to record",
+        lower_bound=1,
+        upper_bound=10_000,
+        flag_values=values,
+    )
+    flags.DEFINE_integer(
+        "image_size",
+        None,
+        "height and width for --convert and --inspect; without it pixels keep theirs",
+        lower_bound=8,
+        upper_bound=1024,
+        flag_values=values,
+    )
+    flags.DEFINE_enum(
+        "render_quality",
+        "paper",
+        ["paper", "fast"],
+        "how states are drawn by --convert and --inspect",
+        flag_values=values,
+    )
+    flags.DEFINE_integer(
+        "frame_skip",
+        1,
+        "--convert keeps every so many-th frame of a file of pixels",
         lower_bound=1,
         upper_bound=10_000,
         flag_values=values,

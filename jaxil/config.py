@@ -76,8 +76,9 @@ def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Conf
     config.encoder.subtract_mean_image = False  # the demonstrations' mean, not 0.5
 
     config.demonstrations = ml_collections.ConfigDict()
-    config.demonstrations.source = ""  # the task's shipped file
+    config.demonstrations.source = ""  # a file or folder; "" is the shipped file
     config.demonstrations.num_episodes = 10
+    config.demonstrations.frame_skip = 1  # of pixel files: every so many-th frame
 
     # P-SIL.
     config.sinkhorn = ml_collections.ConfigDict()
@@ -105,6 +106,11 @@ def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Conf
 def uses_demonstrations(config: Config) -> bool:
     """Says whether a run of this config reads demonstrations."""
     return config.method in ("pdac", "psil") or config.encoder.subtract_mean_image
+
+
+def sees_actions(config: Config) -> bool:
+    """Says whether the method reads the expert's actions."""
+    return config.method == "pdac" and config.discriminator.sees_actions
 
 
 def memory_bytes(config: Config) -> int:
@@ -172,6 +178,7 @@ _RANGES: dict[str, tuple[float, float, str]] = {
     "pre_tanh_penalty": (0.0, 1e3, "0 in the paper"),
     "encoder.contrast": (1e-6, 1e6, "1 in the paper"),
     "demonstrations.num_episodes": (1, 10**6, "1, 10 or 50 in the paper"),
+    "demonstrations.frame_skip": (1, 10**4, "1 keeps every frame of a pixel file"),
     "sinkhorn.epsilon": (1e-6, 1e3, "0.01 in the reference"),
     "sinkhorn.num_iterations": (1, 10**6, "100 in the reference"),
     "sinkhorn.target_update_steps": (1, 10**9, "10000 in the paper"),

@@ -194,41 +194,37 @@ def memory(config: Any) -> Iterator[Finding]:
 
 def demonstrations(config: Any) -> Iterator[Finding]:
     """Reads the shipped demonstrations, and those of `config`, and draws a little."""
-    from jaxil.host import demonstrations as host
+    from jaxil.host import states
 
-    shipped = host.shipped_tasks()
+    shipped = states.shipped_tasks()
     if not shipped:
         advice = "install the package again; its demonstrations folder is empty"
         yield Finding("fault", "demonstrations", "none are shipped", advice)
     for task in shipped:
-        yield _try_demonstrations(host.shipped_path(task), task)
+        yield _try_demonstrations(states.shipped_path(task), task)
     if config is None:
         return
     from jaxil import config as jaxil_config
+    from jaxil import experiment
 
     if not jaxil_config.uses_demonstrations(config):
         return
-    source = config.demonstrations.source
-    try:
-        host.check(
-            source,
-            task=config.task,
-            num_episodes=config.demonstrations.num_episodes,
-            action_repeat=config.action_repeat,
-        )
-    except host.DemonstrationError as error:
-        yield Finding("fault", "demonstrations", str(error))
-        return
-    if source:
-        yield _try_demonstrations(pathlib.Path(source), config.task)
+    fault = experiment.demonstration_fault(config)
+    source = pathlib.Path(config.demonstrations.source)
+    if fault is not None:
+        yield Finding("fault", "demonstrations", fault)
+    elif states.recognises(source):
+        yield _try_demonstrations(source, config.task)
+    elif config.demonstrations.source:
+        yield Finding("ok", "demonstrations", f"{source}: pixels that can be read")
 
 
 def _try_demonstrations(path: pathlib.Path, task: str) -> Finding:
-    from jaxil.host import demonstrations as host
     from jaxil.host import rendering as drawing
+    from jaxil.host import states
 
     try:
-        stored = host.read_states(path, task=task)
+        stored = states.read_states(path, task=task)
         frames = drawing.observe_episodes(
             {
                 name: getattr(stored, name)[:1, :_NUM_TRIED_STATES]

@@ -52,9 +52,9 @@ def main(argv: list[str]) -> None:
     )
     expert_frames = None
     if run.demonstrations is not None:
-        line += (
-            f"; the expert's mean {np.mean(run.demonstrations.metadata['returns']):.1f}"
-        )
+        expert_return = run.demonstrations.mean_return()
+        if expert_return is not None:
+            line += f"; the expert's mean {expert_return:.1f}"
         if run.demonstrations.frames.ndim == 5:
             expert_frames = run.demonstrations.frames[0]
     print(line)

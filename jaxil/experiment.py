@@ -7,6 +7,7 @@ import numpy as np
 import optax
 
 from jaxil import config as jaxil_config
+from jaxil import platform
 from jaxil.config import Config
 from jaxil.host import demonstrations as host_demonstrations
 from jaxil.host.environment import (
@@ -14,7 +15,9 @@ from jaxil.host.environment import (
     known_tasks,
     make_environment,
 )
+from jaxil.host.progress import ProgressLine
 from jaxil.host.replay import Replay
+from jaxil.host.states import DemonstrationError
 from jaxil.learner.policy import Exploit, Explore, make_exploit, make_explore
 from jaxil.learner.state import TrainState
 from jaxil.learner.update import (
@@ -32,6 +35,9 @@ from jaxil.rewarders.task import make_task_rewarder, make_zero_rewarder
 
 # Added to the seed for what must not share its random starts with training.
 _EVALUATION_SEED = 1_000_003
+# A fault in one of these leaves no sense in opening the demonstrations.
+_READING_FIELDS = ("demonstrations.", "image_size", "action_repeat", "observation")
+_ASSUMED_MEMORY = 4 * 2**30  # bytes, where the machine doesn't tell
 
 
 class Agent(NamedTuple):
@@ -60,20 +66,29 @@ def problems(config: Config) -> list[str]:
     Reads the demonstration file, but renders nothing.
     """
     faults = jaxil_config.problems(config, known_tasks())
-    readable = config.task in known_tasks() and config.demonstrations.num_episodes > 0
+    readable = config.task in known_tasks() and not any(
+        fault.startswith(_READING_FIELDS) for fault in faults
+    )
     if readable and jaxil_config.uses_demonstrations(config):
-        try:
-            host_demonstrations.check(
-                config.demonstrations.source,
-                task=config.task,
-                num_episodes=config.demonstrations.num_episodes,
-                action_repeat=config.action_repeat,
-            )
-        except host_demonstrations.DemonstrationError as error:
+        fault = demonstration_fault(config)
+        if fault is not None:
             faults.append(
-                f"demonstrations.source={config.demonstrations.source!r}: {error}"
+                f"demonstrations.source={config.demonstrations.source!r}: {fault}"
             )
     return faults
+
+
+def demonstration_fault(config: Config) -> str | None:
+    """Returns why the config's demonstrations can't serve it; None if they can."""
+    try:
+        host_demonstrations.check(
+            config.demonstrations.source,
+            sees_actions=jaxil_config.sees_actions(config),
+            **_file_settings(config),
+        )
+    except DemonstrationError as error:
+        return str(error)
+    return None
 
 
 def renderer_name(config: Config) -> str:
@@ -112,25 +127,60 @@ def environment_with_seed(config: Config, seed: int) -> PixelEnvironment:
 
 
 def load_demonstrations(
-    config: Config, progress: Any = None
+    config: Config,
 ) -> host_demonstrations.Demonstrations | None:
     """Returns the demonstrations of a run, rendered as the agent sees; or None.
+
+    Drawing them takes minutes at quality `paper` in software, the first time: a
+    progress line is shown.
 
     Raises:
       DemonstrationError: the file can't serve this run.
     """
     if not jaxil_config.uses_demonstrations(config):
         return None
-    return host_demonstrations.load(
-        config.demonstrations.source,
-        task=config.task,
-        num_episodes=config.demonstrations.num_episodes,
-        action_repeat=config.action_repeat,
-        image_size=config.image_size,
-        render_quality=config.render_quality,
-        observation=config.observation,
-        progress=progress,
-    )
+    lines: list[ProgressLine] = []
+
+    def show(done: int, total: int) -> None:
+        if not lines:
+            label = "drawing the demonstrations, once"
+            lines.append(
+                ProgressLine(total, first_frame=done, label=label, unit="images")
+            )
+        lines[0].update(done, {})
+
+    try:
+        return host_demonstrations.load(
+            config.demonstrations.source,
+            render_quality=config.render_quality,
+            progress=show,
+            **_file_settings(config),
+        )
+    finally:
+        for line in lines:
+            line.close()
+
+
+def _file_settings(config: Config) -> dict[str, Any]:
+    """Returns what decides whether a demonstration file can serve a run."""
+    return {
+        "task": config.task,
+        "num_episodes": config.demonstrations.num_episodes,
+        "action_repeat": config.action_repeat,
+        "image_size": config.image_size,
+        "observation": config.observation,
+        "frame_skip": config.demonstrations.frame_skip,
+        "max_bytes": spare_bytes(),
+    }
+
+
+def spare_bytes() -> int:
+    """Returns how much memory demonstrations may take: half of what is available.
+
+    In whole GiB, so that a file read twice is read under the same limit.
+    """
+    available = platform.available_memory_bytes() or _ASSUMED_MEMORY
+    return max(available // 2 // 2**30, 1) * 2**30
 
 
 def make_replay(config: Config, environment: PixelEnvironment) -> Replay:
@@ -191,10 +241,11 @@ def mean_image(
     if not config.encoder.subtract_mean_image or demonstrations is None:
         return 0.5
     total = np.zeros(demonstrations.frames.shape[2:], np.float64)
-    for episode in demonstrations.frames:  # one at a time: bounded memory
-        total += episode.sum(axis=0, dtype=np.float64)
-    count = demonstrations.frames.shape[0] * demonstrations.frames.shape[1]
-    mean = (total / count / 255.0).astype(np.float32)
+    lengths = demonstrations.num_frames
+    for episode, length in zip(demonstrations.frames, lengths, strict=True):
+        # One at a time: bounded memory.
+        total += episode[:length].sum(axis=0, dtype=np.float64)
+    mean = (total / lengths.sum() / 255.0).astype(np.float32)
     return np.concatenate([mean] * config.frame_stack, axis=-1)
 
 
@@ -283,9 +334,13 @@ def expert_episodes(
     """Puts the demonstrations on the device, where the method matches episodes."""
     if not rewarder.matches_episodes or demonstrations is None:
         return None
+    actions = demonstrations.actions
+    if actions is None:
+        actions = np.zeros((*demonstrations.frames.shape[:1], 0, 0), np.float32)
     return ExpertEpisodes(
         jax.numpy.asarray(demonstrations.frames),
-        jax.numpy.asarray(demonstrations.actions),
+        jax.numpy.asarray(demonstrations.num_frames),
+        jax.numpy.asarray(actions),
     )
 
 

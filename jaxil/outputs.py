@@ -52,7 +52,7 @@ class Outputs:
         self._expert_frames: np.ndarray | None = None
         self._expert_return: float | None = None
         if demonstrations is not None:
-            self._expert_return = float(np.mean(demonstrations.metadata["returns"]))
+            self._expert_return = demonstrations.mean_return()
             if demonstrations.frames.ndim == 5:
                 self._expert_frames = demonstrations.frames[0]
         self._pre_tanh = float("nan")

@@ -5,15 +5,13 @@ from typing import Any
 import numpy as np
 
 from jaxil import experiment
-from jaxil.host import demonstrations
+from jaxil.host import states
 from jaxil.trained import Trained
 
 _STATE_NAMES = ("qpos", "qvel", "act")
 
 
-def record(
-    run: Trained, *, num_episodes: int, seed: int
-) -> demonstrations.StateDemonstrations:
+def record(run: Trained, *, num_episodes: int, seed: int) -> states.StateDemonstrations:
     """Returns deterministic episodes of a policy, from different resets.
 
     Args:
@@ -22,7 +20,7 @@ def record(
       seed: of the resets.
     """
     environment = experiment.environment_with_seed(run.config, seed)
-    states: dict[str, list[Any]] = {name: [] for name in _STATE_NAMES}
+    all_states: dict[str, list[Any]] = {name: [] for name in _STATE_NAMES}
     all_actions, all_rewards = [], []
     for episode in range(num_episodes):
         timestep = environment.reset(episode=episode)
@@ -34,16 +32,16 @@ def record(
             actions.append(action)
             rewards.append(timestep.reward)
         for name in _STATE_NAMES:
-            states[name].append(np.stack([state[name] for state in visited]))
+            all_states[name].append(np.stack([state[name] for state in visited]))
         all_actions.append(np.stack(actions))
         all_rewards.append(rewards)
     rewards = np.asarray(all_rewards, np.float32)
     config = run.config
-    return demonstrations.StateDemonstrations(
-        **{name: np.stack(episodes) for name, episodes in states.items()},
+    return states.StateDemonstrations(
+        **{name: np.stack(episodes) for name, episodes in all_states.items()},
         actions=np.stack(all_actions).astype(np.float32),
         rewards=rewards,
-        metadata=demonstrations.new_metadata(
+        metadata=states.new_metadata(
             task=config.task,
             action_repeat=config.action_repeat,
             seed=seed,

@@ -25,7 +25,6 @@ from jaxil.maths.types import Batch, Episode, ExpertBatch
 # Names of NumPy's random streams: every draw is keyed by (seed, stream, step), so
 # that a resumed run repeats those of an unbroken one without any stored state.
 _UNIFORM_ACTIONS, _SAMPLED_BATCHES = 1, 2
-_DRAWN_PER_LINE = 1_000  # images
 _EXPLORATION_KEY = 2**32 - 2  # a fold_in number that no update has
 
 
@@ -327,12 +326,7 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
     def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
-    def say_drawn(done: int, total: int) -> None:
-        # Minutes at quality `paper` in software, so not in silence.
-        if done % _DRAWN_PER_LINE == 0 or done == total:
-            say(f"drawing the demonstrations, once: {done} of {total} images")
-
-    demonstrations = experiment.load_demonstrations(config, say_drawn)
+    demonstrations = experiment.load_demonstrations(config)
     say(f"{config.task}: {METHODS[config.method]}, seed {config.seed}")
     run = Run(config, workdir, demonstrations, say)
     run.say = run.progress.message

@@ -8,7 +8,7 @@ import pytest
 from jaxil import config as jaxil_config
 from jaxil import doctor, platform
 from jaxil.command import UsageError
-from jaxil.host import demonstrations
+from jaxil.host import states
 from jaxil.host import environment as environments
 
 
@@ -39,7 +39,7 @@ def test_a_line_says_level_what_value_and_advice():
 
 
 def test_this_machine_passes(config, monkeypatch):
-    monkeypatch.setattr(demonstrations, "shipped_tasks", lambda: ())
+    monkeypatch.setattr(states, "shipped_tasks", lambda: ())
     findings = list(doctor.examine(config))
     faults = [finding for finding in findings if finding.level == "fault"]
     assert [fault.value for fault in faults] == ["none are shipped"]
@@ -188,7 +188,7 @@ def test_demonstrations_that_cannot_be_used(monkeypatch, config, tmp_path):
 
     broken = tmp_path / "walker_walk.npz"
     broken.write_bytes(b"PK")
-    monkeypatch.setattr(demonstrations, "_shipped_folder", lambda: tmp_path)
+    monkeypatch.setattr(states, "_shipped_folder", lambda: tmp_path)
     first = next(doctor.demonstrations(None))
     assert (first.level, str(broken) in first.value) == ("fault", True)
 

@@ -5,7 +5,7 @@ import pytest
 
 from jaxil import config as jaxil_config
 from jaxil import experiment
-from jaxil.host import demonstrations
+from jaxil.host import states
 from tests.commands import run, small_run
 
 _TASKS = ("walker_walk", "cartpole_swingup")
@@ -109,12 +109,12 @@ def test_wrong_command_lines(flags, expected):
 def test_demonstrations_are_checked_before_anything_starts(tmp_path):
     config = jaxil_config.default_config("pdac", "walker_walk")
     cut_off = tmp_path / "cut.npz"
-    whole = demonstrations.shipped_path("ball_in_cup_catch").read_bytes()
+    whole = states.shipped_path("ball_in_cup_catch").read_bytes()
     cut_off.write_bytes(whole[: len(whole) // 2])
     sources = {
         str(tmp_path / "none.npz"): "none.npz",
         str(cut_off): "cut.npz",
-        str(demonstrations.shipped_path("ball_in_cup_catch")): "ball_in_cup_catch",
+        str(states.shipped_path("ball_in_cup_catch")): "ball_in_cup_catch",
     }
     for source, expected in sources.items():
         config.demonstrations.source = source

@@ -1,18 +1,47 @@
 """Reading NumPy archives (.npz) that may be damaged, or made to do damage."""
 
+import errno
 import io
 import math
 import os
 import pathlib
+import re
 import struct
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 MAX_MEMBER_BYTES = 2 * 1024**3
+# What zipfile raises for bytes that are not as they should be.
+_DAMAGES = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    EOFError,
+    NotImplementedError,  # an unknown compression
+    RuntimeError,  # encrypted
+)
+
+# How many bytes one compressed byte can stand for, at most.
+_MAX_RATIOS = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
+_LENGTH_FORMATS = {(1, 0): "<H", (2, 0): "<I"}  # of an .npy header, by version
+_HEADER = re.compile(
+    rb"\{'descr': '([<>|=][biufcSUVOmM]\d{0,9})', 'fortran_order': (?:True|False), "
+    rb"'shape': \(((?:\d{1,18}(?:, \d{1,18}){0,31},?)?)\), \} *\n"
+)
+
+
+def member_names(path: pathlib.Path) -> frozenset[str]:
+    """Returns the names of an archive's arrays; none if it is no archive."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except (OSError, ValueError, *_DAMAGES):
+        return frozenset()
+    return frozenset(name.removesuffix(".npy") for name in names)
 
 
 def read_archive(
@@ -40,39 +69,46 @@ def read_archive(
             if missing:
                 raise ValueError(f"has no array {', '.join(missing)}")
             return {
-                name: _read_member(archive, stored[f"{name}.npy"], name, limit)
+                name: _read_member(
+                    archive, stored[f"{name}.npy"], name, limit, path.stat().st_size
+                )
                 for name, limit in max_bytes.items()
             }
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        struct.error,
-        EOFError,
-        NotImplementedError,  # an unknown compression
-        RuntimeError,  # encrypted
-    ) as error:
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # a place before the file's beginning
+            raise
+        raise ValueError(
+            "is cut off, damaged or no .npz file (a bad offset)"
+        ) from error
+    except _DAMAGES as error:
         raise ValueError(f"is cut off, damaged or no .npz file ({error})") from error
 
 
 def _read_member(
-    archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str, limit: int
+    archive: zipfile.ZipFile,
+    info: zipfile.ZipInfo,
+    name: str,
+    limit: int,
+    file_bytes: int,
 ) -> np.ndarray:
     if info.file_size > limit:
         raise ValueError(
             f"has an array {name} of {info.file_size} bytes, more than the {limit} "
             "that are accepted"
         )
-    # Bounded by the size just checked, whatever the compressed bytes unpack to.
+    if info.compress_type not in _MAX_RATIOS:
+        raise NotImplementedError("an unknown compression")
+    if (
+        info.compress_size > file_bytes
+        or info.file_size > info.compress_size * _MAX_RATIOS[info.compress_type]
+    ):
+        raise ValueError(f"has an array {name} that is not as long as it says")
+    # Asked for by its size: `read()` would unpack up to 2 GB before it looks.
     with archive.open(info) as member:
-        content = io.BytesIO(member.read())
+        content = io.BytesIO(member.read(info.file_size))
     try:
-        version = np.lib.format.read_magic(content)
-        read_header = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }[version]
-        shape, _, dtype = read_header(content)
-    except (ValueError, KeyError, SyntaxError) as error:
+        shape, dtype = _read_header(content)
+    except (ValueError, TypeError) as error:
         raise ValueError(f"has an unreadable array {name} ({error})") from error
     if dtype.hasobject:
         raise ValueError(f"has an array {name} of Python objects, not of numbers")
@@ -83,8 +119,36 @@ def _read_member(
     return np.lib.format.read_array(content, allow_pickle=False)
 
 
-def write_archive(path: pathlib.Path, arrays: Mapping[str, np.ndarray]) -> None:
+def _read_header(content: io.BytesIO) -> tuple[tuple[int, ...], np.dtype]:
+    """Returns shape and type of an .npy file, which may not be all that Python knows.
+
+    NumPy's own function evaluates the header as an expression, and hostile ones make
+    it raise anything, or warn.
+    """
+    version = np.lib.format.read_magic(content)
+    if version not in _LENGTH_FORMATS:
+        raise ValueError(f"version {version} of the .npy format")
+    length_format = _LENGTH_FORMATS[version]
+    (length,) = struct.unpack(
+        length_format, content.read(struct.calcsize(length_format))
+    )
+    header = _HEADER.fullmatch(content.read(length))
+    if header is None:
+        raise ValueError("not the header of a plain array")
+    descr, sizes = (group.decode() for group in header.groups())
+    dtype = np.dtype(descr)
+    if dtype.itemsize == 0:
+        raise ValueError("its items have no size")
+    return tuple(int(size) for size in sizes.split(",") if size.strip()), dtype
+
+
+def write_archive(path: pathlib.Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
     """Writes a compressed archive, whole or not at all.
+
+    Args:
+      path: the file.
+      arrays: pairs of a name and an array; taken one at a time, so that they need not
+        all be in memory.
 
     Raises:
       OSError: the folder cannot be written.
@@ -94,7 +158,10 @@ def write_archive(path: pathlib.Path, arrays: Mapping[str, np.ndarray]) -> None:
     temporary = pathlib.Path(name)
     try:
         with os.fdopen(handle, "wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
+            with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+                for name, array in arrays:
+                    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                        np.lib.format.write_array(member, array, allow_pickle=False)
             file.flush()
             os.fsync(file.fileno())
         temporary.chmod(0o644)  # mkstemp's is for the owner only

@@ -1,20 +1,7 @@
-"""Demonstrations: a small file of simulator states, drawn where they are used.
-
-Such a file is a NumPy archive (.npz) of K episodes of T agent steps:
-
-    qpos, qvel, act   float64 [K, T + 1, nq], [K, T + 1, nv], [K, T + 1, na]
-    actions, rewards  float32 [K, T, A], [K, T]
-    metadata          a JSON text, see `new_metadata`
-
-Pixels are not stored: they would be a thousand times larger, and would not match the
-renderer of another machine. Baselines alone may look at actions and rewards.
-"""
+"""Demonstrations as the agent would see them, whatever file they come from."""
 
 import functools
-import importlib.metadata
-import json
 import logging
-import math
 import os
 import pathlib
 from collections.abc import Callable
@@ -22,57 +9,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxil.host import archive, rendering
 from jaxil.host import environment as environments
+from jaxil.host import foreign, rendering, states
+from jaxil.host.readers.recording import FormatError
 from jaxil.host.stacking import gather_stacks
+from jaxil.host.states import StateDemonstrations, fault
 
-FORMAT = "jaxil-demonstrations"
-VERSION = 1
-_MAX_METADATA_BYTES = 1024**2
-_ARRAYS = {  # name: dtype, number of axes, states per episode beyond its steps
-    "qpos": (np.dtype(np.float64), 3, 1),
-    "qvel": (np.dtype(np.float64), 3, 1),
-    "act": (np.dtype(np.float64), 3, 1),
-    "actions": (np.dtype(np.float32), 3, 0),
-    "rewards": (np.dtype(np.float32), 2, 0),
-}
-_METADATA = {
-    "task": str,
-    "action_repeat": int,
-    "camera": int,
-    "versions": dict,
-    "seed": int,
-    "first_episode": int,
-    "expert": str,
-    "returns": list,
-}
-_REMAKE = "Record it again with `python -m jaxil.collect`, or name another file"
+# A video's frame rate may be off by this share before anyone is told.
+_RATE_TOLERANCE = 0.1
+_WAY_OUT = (
+    "Repair or replace it; `python -m jaxil.collect --inspect=FILE` shows what a file "
+    "holds"
+)
 
 _logger = logging.getLogger(__name__)
-
-
-class DemonstrationError(ValueError):
-    """Demonstrations cannot be used; says which file, why, and what helps."""
-
-
-class StateDemonstrations(NamedTuple):
-    """What a demonstration file holds.
-
-    Attributes:
-      qpos: positions, float64 [K, T + 1, nq].
-      qvel: velocities, float64 [K, T + 1, nv].
-      act: activations of the actuators, float64 [K, T + 1, na].
-      actions: float32 [K, T, A], in [-1, 1].
-      rewards: the task's, summed over the action repeat. float32 [K, T].
-      metadata: see `new_metadata`.
-    """
-
-    qpos: np.ndarray
-    qvel: np.ndarray
-    act: np.ndarray
-    actions: np.ndarray
-    rewards: np.ndarray
-    metadata: dict[str, Any]
 
 
 class Demonstrations(NamedTuple):
@@ -80,155 +30,81 @@ class Demonstrations(NamedTuple):
 
     Attributes:
       frames: single images, uint8 [K, N + 1, H, W, 3], or, where the agent observes
-        states, float32 [K, N + 1, S].
-      actions: float32 [K, N, A]; only for methods that may see them.
-      task_rewards: float32 [K, N]; only to be logged.
-      metadata: the file's, with `file`, and `action_repeat` and `returns` as served.
+        states, float32 [K, N + 1, S]. A shorter episode repeats its last frame.
+      num_frames: how many of them are the episode's own. Shape [K].
+      actions: float32 [K, N, A]; only for methods that may see them. None where the
+        file has none.
+      task_rewards: float32 [K, N]; only to be logged. None where the file has none.
+      metadata: the file's, with `file`, `action_repeat`, and `returns` as served: one
+        number for each episode, or none at all.
     """
 
     frames: np.ndarray
-    actions: np.ndarray
-    task_rewards: np.ndarray
+    num_frames: np.ndarray
+    actions: np.ndarray | None
+    task_rewards: np.ndarray | None
     metadata: dict[str, Any]
 
-
-def new_metadata(
-    *,
-    task: str,
-    action_repeat: int,
-    seed: int,
-    first_episode: int,
-    expert: str,
-    rewards: np.ndarray,
-    camera: int | None = None,
-) -> dict[str, Any]:
-    """Returns the metadata of freshly recorded demonstrations.
-
-    Args:
-      task: `domain_task`.
-      action_repeat: environment frames per stored step.
-      seed: the recording environment's; with the episode's number it restores what
-        a task draws at random beyond the state.
-      first_episode: number of episode 0; the others follow it without a gap.
-      expert: how the expert was made, for people.
-      rewards: task rewards. Shape [K, T].
-      camera: what the expert was looked at through; None for `camera_of(task)`.
-    """
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "task": task,
-        "action_repeat": action_repeat,
-        "camera": environments.camera_of(task) if camera is None else camera,
-        "versions": {
-            **environments.simulator_versions(),
-            "jaxil": importlib.metadata.version("jaxil"),
-        },
-        "seed": seed,
-        "first_episode": first_episode,
-        "expert": expert,
-        "returns": np.asarray(rewards, np.float64).sum(axis=1).tolist(),
-    }
-
-
-def shipped_tasks() -> tuple[str, ...]:
-    """Returns the tasks whose demonstrations are part of the package, sorted."""
-    return tuple(sorted(path.stem for path in _shipped_folder().glob("*.npz")))
-
-
-def shipped_path(task: str) -> pathlib.Path:
-    """Returns the package's own demonstrations of `task`.
-
-    Raises:
-      DemonstrationError: none are shipped for it.
-    """
-    path = _shipped_folder() / f"{task}.npz"
-    if task not in shipped_tasks():
-        raise DemonstrationError(
-            f"no demonstrations of {task} are shipped, only of: "
-            f"{', '.join(shipped_tasks()) or 'no task'}. Record some with "
-            "`python -m jaxil.collect` and name the file in demonstrations.source."
-        )
-    return path
-
-
-def write_states(path: str | os.PathLike, demonstrations: StateDemonstrations) -> None:
-    """Writes a demonstration file, whole or not at all.
-
-    Raises:
-      DemonstrationError: the arrays or the metadata break the format's rules.
-    """
-    path = pathlib.Path(path)
-    _check(path, demonstrations)
-    arrays = {
-        name: getattr(demonstrations, name).astype(dtype)
-        for name, (dtype, _, _) in _ARRAYS.items()
-    }
-    arrays["metadata"] = np.array(json.dumps(demonstrations.metadata))
-    archive.write_archive(path, arrays)
-
-
-def read_states(
-    path: str | os.PathLike, *, task: str | None = None, num_episodes: int | None = None
-) -> StateDemonstrations:
-    """Reads a demonstration file and checks all of it; nothing is drawn.
-
-    Args:
-      path: the file.
-      task: the task that it must be of; None takes any.
-      num_episodes: how many episodes to return, the first ones; None for all.
-
-    Raises:
-      DemonstrationError: the file cannot be read, is not one of demonstrations,
-        is damaged, or is not what was asked for.
-    """
-    path = pathlib.Path(path)
-    limits = dict.fromkeys(_ARRAYS, archive.MAX_MEMBER_BYTES)
-    limits["metadata"] = _MAX_METADATA_BYTES
-    try:
-        arrays = archive.read_archive(path, max_bytes=limits)
-        metadata = json.loads(str(arrays.pop("metadata")))
-    except OSError as error:
-        raise _fault(
-            path,
-            f"cannot be read ({error.strerror or error})",
-            "Check the path in demonstrations.source",
-        ) from error
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise _fault(path, f"has metadata that are not JSON ({error})") from error
-    except ValueError as error:
-        raise _fault(path, str(error)) from error
-    demonstrations = StateDemonstrations(**arrays, metadata=metadata)
-    _check(path, demonstrations)
-    if task is not None and metadata["task"] != task:
-        raise _fault(
-            path,
-            f"shows {metadata['task']}, but the task is {task}",
-            "Set the one to the other's",
-        )
-    stored = len(demonstrations.rewards)
-    if num_episodes is None:
-        return demonstrations
-    if not 1 <= num_episodes <= stored:
-        raise _fault(
-            path,
-            f"holds {stored} episodes, and num_episodes={num_episodes} were asked for",
-            f"Ask for 1 to {stored}",
-        )
-    kept = [array[:num_episodes] for array in demonstrations[:-1]]
-    metadata = {**metadata, "returns": metadata["returns"][:num_episodes]}
-    return StateDemonstrations(*kept, metadata=metadata)
+    def mean_return(self) -> float | None:
+        """Returns the mean task return; None where rewards are not known."""
+        returns = self.metadata["returns"]
+        return float(np.mean(returns)) if returns else None
 
 
 def check(
-    source: str | os.PathLike, *, task: str, num_episodes: int, action_repeat: int
+    source: str | os.PathLike,
+    *,
+    task: str,
+    num_episodes: int,
+    action_repeat: int,
+    image_size: int = 84,
+    observation: str = "pixels",
+    frame_skip: int = 1,
+    max_bytes: int = states.MAX_ARRAY_BYTES,
+    sees_actions: bool = False,
 ) -> None:
     """Finds out whether `load` would succeed, without drawing anything.
+
+    Args:
+      source: see `load`, as all others.
+      sees_actions: whether the method needs the expert's actions.
 
     Raises:
       DemonstrationError: as `load`.
     """
-    _open(source, task=task, num_episodes=num_episodes, action_repeat=action_repeat)
+    path = _path_of(source, task)
+    if states.recognises(path):
+        _open_states(
+            path,
+            task=task,
+            num_episodes=num_episodes,
+            action_repeat=action_repeat,
+            frame_skip=frame_skip,
+        )
+        return
+    loaded = _load_pixels(
+        path,
+        task=task,
+        num_episodes=num_episodes,
+        image_size=image_size,
+        observation=observation,
+        frame_skip=frame_skip,
+        max_bytes=max_bytes,
+    )
+    if not sees_actions:
+        return
+    if loaded.actions is None:
+        raise fault(
+            path, "holds no actions, which this method sees", "Choose another method"
+        )
+    needed = _model_sizes(task)["actions"]
+    if loaded.actions.shape[2] != needed:
+        raise fault(
+            path,
+            f"has actions of {loaded.actions.shape[2]} numbers, where {task} needs "
+            f"{needed}",
+            "Choose a method that sees no actions",
+        )
 
 
 def load(
@@ -240,38 +116,61 @@ def load(
     image_size: int,
     render_quality: str,
     observation: str = "pixels",
+    frame_skip: int = 1,
+    max_bytes: int = states.MAX_ARRAY_BYTES,
     cache: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Demonstrations:
-    """Loads demonstrations as the agent's own environment would show them.
+    """Loads demonstrations, those of states as the agent's own environment shows them.
 
     Args:
-      source: a demonstration file; "" for the task's shipped one.
+      source: a file or folder of any format in `foreign.FORMATS`; "" for the states
+        that are shipped for the task.
       task: `domain_task`.
       num_episodes: how many, the file's first ones.
-      action_repeat: the agent's; a multiple of the file's. Of the steps that become
+      action_repeat: the agent's; a multiple of a state file's. Of the steps that become
         one, rewards are summed and the first one's action stands for all.
       image_size: height and width in pixels.
       render_quality: "paper" or "fast".
       observation: "pixels" or "state".
-      cache: whether to keep the images, in `rendering.cache_folder()`.
+      frame_skip: for files of pixels: every so many-th frame is kept.
+      max_bytes: for files of pixels: the memory that they may take.
+      cache: whether to keep drawn images, in `rendering.cache_folder()`.
       progress: called with (images drawn, images in all) when anything is drawn.
 
     Raises:
-      DemonstrationError: see `read_states`; or the action repeats don't fit.
+      DemonstrationError: the file can't be read, is not one of demonstrations, is
+        damaged, or is not what was asked for.
     """
-    path, states, stride = _open(
-        source, task=task, num_episodes=num_episodes, action_repeat=action_repeat
+    path = _path_of(source, task)
+    if not states.recognises(path):
+        loaded = _load_pixels(
+            path,
+            task=task,
+            num_episodes=num_episodes,
+            image_size=image_size,
+            observation=observation,
+            frame_skip=frame_skip,
+            max_bytes=max_bytes,
+        )
+        _warn_of_pixels(path, loaded, task=task, action_repeat=action_repeat)
+        return loaded
+    stored, stride = _open_states(
+        path,
+        task=task,
+        num_episodes=num_episodes,
+        action_repeat=action_repeat,
+        frame_skip=frame_skip,
     )
-    num_steps = states.rewards.shape[1] // stride
-    _warn_of_versions(path, states.metadata["versions"])
+    num_steps = stored.rewards.shape[1] // stride
+    _warn_of_versions(path, stored.metadata["versions"])
     steps = slice(0, num_steps * stride + 1, stride)
     try:
         frames = rendering.observe_episodes(
-            {name: getattr(states, name)[:, steps] for name in ("qpos", "qvel", "act")},
+            {name: getattr(stored, name)[:, steps] for name in ("qpos", "qvel", "act")},
             task=task,
-            seed=states.metadata["seed"],
-            first_episode=states.metadata["first_episode"],
+            seed=stored.metadata["seed"],
+            first_episode=stored.metadata["first_episode"],
             image_size=image_size,
             render_quality=render_quality,
             observation=observation,
@@ -279,17 +178,21 @@ def load(
             progress=progress,
         )
     except ValueError as error:
-        raise _fault(path, f"cannot be shown ({error})") from error
-    used = states.rewards[:, : num_steps * stride]
+        raise fault(path, f"cannot be shown ({error})") from error
+    used = stored.rewards[:, : num_steps * stride]
     task_rewards = used.reshape(num_episodes, num_steps, stride).sum(2)
-    metadata = {
-        **states.metadata,
-        "file": str(path),
-        "action_repeat": action_repeat,
-        "returns": task_rewards.astype(np.float64).sum(axis=1).tolist(),
-    }
-    actions = states.actions[:, : num_steps * stride : stride]
-    return Demonstrations(frames, actions, task_rewards, metadata)
+    return Demonstrations(
+        frames,
+        np.full(num_episodes, num_steps + 1),
+        stored.actions[:, : num_steps * stride : stride],
+        task_rewards,
+        {
+            **stored.metadata,
+            "file": str(path),
+            "action_repeat": action_repeat,
+            "returns": _returns(task_rewards),
+        },
+    )
 
 
 def sample(
@@ -310,113 +213,154 @@ def sample(
 
     Returns:
       Observations uint8 [B, H, W, 3 * frame_stack] or float32 [B, S], and actions
-      [B, A].
+      [B, A]; A is 0 where the demonstrations have none.
     """
-    num_episodes, num_steps = demonstrations.actions.shape[:2]
-    episodes = rng.integers(num_episodes, size=batch_size)
-    steps = rng.integers(num_steps, size=batch_size)
+    num_steps = demonstrations.num_frames - 1  # no action follows the last frame
+    ends = np.cumsum(num_steps)
+    drawn = rng.integers(ends[-1], size=batch_size)
+    episodes = np.searchsorted(ends, drawn, side="right")
+    steps = drawn - (ends - num_steps)[episodes]
     # As one long row of frames, without a copy, from which stacks are gathered.
     frames = demonstrations.frames.reshape(-1, *demonstrations.frames.shape[2:])
     ages = np.arange(frame_stack - 1, -1, -1)
     times = np.maximum(steps[:, None] - ages, 0)
-    indices = episodes[:, None] * (num_steps + 1) + times
-    return gather_stacks(frames, indices), demonstrations.actions[episodes, steps]
+    indices = episodes[:, None] * demonstrations.frames.shape[1] + times
+    actions = (
+        np.zeros((batch_size, 0), np.float32)
+        if demonstrations.actions is None
+        else demonstrations.actions[episodes, steps]
+    )
+    return gather_stacks(frames, indices), actions
 
 
-def _shipped_folder() -> pathlib.Path:
-    return pathlib.Path(__file__).parent.parent / "demonstrations"
+def _path_of(source: str | os.PathLike, task: str) -> pathlib.Path:
+    return pathlib.Path(source) if str(source) else states.shipped_path(task)
 
 
-def _fault(
-    path: pathlib.Path, fault: str, way_out: str = _REMAKE
-) -> DemonstrationError:
-    return DemonstrationError(f"{path} {fault}. {way_out}.")
+def _returns(task_rewards: np.ndarray | None) -> list[float]:
+    if task_rewards is None:
+        return []
+    return task_rewards.astype(np.float64).sum(axis=1).tolist()
 
 
-def _check(path: pathlib.Path, demonstrations: StateDemonstrations) -> None:
-    """Raises DemonstrationError where arrays or metadata break the format's rules."""
-    fault = _metadata_fault(demonstrations.metadata) or _array_fault(demonstrations)
-    if fault is not None:
-        raise _fault(path, fault)
-
-
-def _metadata_fault(metadata: Any) -> str | None:
-    if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
-        return "is not a file of demonstrations: its metadata lack the format's name"
-    if metadata.get("version") != VERSION:
-        return (
-            f"has version {metadata.get('version')!r} of the format, where this "
-            f"program reads version {VERSION}"
-        )
-    for name, kind in _METADATA.items():
-        value = metadata.get(name)
-        if not isinstance(value, kind) or isinstance(value, bool):
-            return f"has metadata {name}={value!r}, where {kind.__name__} is expected"
-    for name, least in (("action_repeat", 1), ("seed", 0), ("first_episode", 0)):
-        if metadata[name] < least:
-            return f"has metadata {name}={metadata[name]}, which is below {least}"
-    return None
-
-
-def _array_fault(demonstrations: StateDemonstrations) -> str | None:
-    rewards = demonstrations.rewards
-    if rewards.ndim != 2 or 0 in rewards.shape:
-        return f"has rewards of shape {rewards.shape}, where [K, T] is expected"
-    num_episodes, num_steps = rewards.shape
-    for name, (dtype, num_axes, extra) in _ARRAYS.items():
-        array = getattr(demonstrations, name)
-        if array.dtype != dtype:
-            return f"has {name} of type {array.dtype}, where {dtype} is expected"
-        if array.ndim != num_axes or array.shape[:2] != (
-            num_episodes,
-            num_steps + extra,
-        ):
-            return (
-                f"has {name} of shape {array.shape}, which does not fit rewards of "
-                f"shape {rewards.shape}"
-            )
-        if not np.isfinite(array).all():
-            episode = int(np.argwhere(~np.isfinite(array))[0, 0])
-            return f"has a NaN or infinity in {name}, episode {episode}"
-    returns = demonstrations.metadata["returns"]
-    numbers = all(isinstance(value, int | float) for value in returns)
-    if (
-        len(returns) != num_episodes
-        or not numbers
-        or not all(map(math.isfinite, returns))
-    ):
-        return f"has metadata returns={returns!r}, where {num_episodes} numbers belong"
-    return None
-
-
-def _open(
-    source: str | os.PathLike, *, task: str, num_episodes: int, action_repeat: int
-) -> tuple[pathlib.Path, StateDemonstrations, int]:
-    """Returns path, contents, and how many stored steps make one of the agent's."""
-    path = pathlib.Path(source) if str(source) else shipped_path(task)
-    states = read_states(path, task=task, num_episodes=num_episodes)
-    recorded = states.metadata["action_repeat"]
+def _open_states(
+    path: pathlib.Path,
+    *,
+    task: str,
+    num_episodes: int,
+    action_repeat: int,
+    frame_skip: int,
+) -> tuple[StateDemonstrations, int]:
+    """Returns a file's contents, and how many stored steps make one of the agent's."""
+    stored = states.read_states(path, task=task, num_episodes=num_episodes)
+    recorded = stored.metadata["action_repeat"]
     if action_repeat < 1 or action_repeat % recorded:
-        raise _fault(
+        raise fault(
             path,
             f"was recorded with action_repeat={recorded}, which cannot serve "
             f"action_repeat={action_repeat}",
             f"Take a multiple of {recorded}, or record it again",
         )
+    if frame_skip != 1:
+        raise fault(
+            path,
+            f"holds states, which follow action_repeat, and frame_skip={frame_skip} "
+            "is for pixels",
+            "Set demonstrations.frame_skip to 1",
+        )
     stride = action_repeat // recorded
-    if stride > states.rewards.shape[1]:
-        raise _fault(
+    if stride > stored.rewards.shape[1]:
+        raise fault(
             path,
             f"has episodes shorter than one step of action_repeat={action_repeat}",
             "Choose a smaller action_repeat",
         )
     for name, size in _model_sizes(task).items():
-        stored = getattr(states, name).shape[2]
-        if stored != size:
-            raise _fault(
-                path, f"has {name} of {stored} numbers, where {task} needs {size}"
+        found = getattr(stored, name).shape[2]
+        if found != size:
+            raise fault(
+                path, f"has {name} of {found} numbers, where {task} needs {size}"
             )
-    return path, states, stride
+    return stored, stride
+
+
+def _load_pixels(path: pathlib.Path, **settings: Any) -> Demonstrations:
+    """Reads a foreign file, or returns it again if it is the last one that was read."""
+    try:
+        parts = sorted(path.rglob("*")) if path.is_dir() else [path]
+        stamps = tuple((str(part), part.stat().st_mtime_ns) for part in parts)
+    except OSError as error:
+        raise fault(
+            path,
+            f"cannot be read ({error.strerror or error})",
+            "Check the path in demonstrations.source",
+        ) from error
+    return _read_pixels(path, stamps, **settings)
+
+
+# Checked at the door and loaded afterwards: both are one reading. The pixels that this
+# keeps are those that the run keeps anyhow.
+@functools.lru_cache(maxsize=1)
+def _read_pixels(
+    path: pathlib.Path,
+    stamps: tuple[tuple[str, int], ...],
+    *,
+    task: str,
+    num_episodes: int,
+    image_size: int,
+    observation: str,
+    frame_skip: int,
+    max_bytes: int,
+) -> Demonstrations:
+    del stamps  # part of the key only
+    if observation != "pixels":
+        raise fault(
+            path,
+            f"holds pixels or is damaged, and cannot serve observation={observation!r}",
+            "Set observation to 'pixels', or name a file of states",
+        )
+    if num_episodes < 1 or frame_skip < 1:
+        raise fault(
+            path,
+            f"cannot serve num_episodes={num_episodes} with frame_skip={frame_skip}",
+            "Both are at least 1",
+        )
+    try:
+        read = foreign.read_episodes(
+            path,
+            num_episodes=num_episodes,
+            image_size=image_size,
+            frame_skip=frame_skip,
+            max_bytes=max_bytes,
+        )
+    except OSError as error:
+        raise fault(
+            path,
+            f"cannot be read ({error.strerror or error})",
+            "Check the path in demonstrations.source",
+        ) from error
+    except FormatError as error:
+        raise fault(path, str(error), _WAY_OUT) from error
+    recording = read.recording
+    if recording.task not in (None, task):
+        raise fault(
+            path,
+            f"shows {recording.task}, but the task is {task}",
+            "Set the one to the other's",
+        )
+    metadata = {
+        "task": recording.task,
+        "file": str(path),
+        "kind": recording.kind,
+        "action_repeat": recording.action_repeat,
+        "frames_per_second": recording.frames_per_second,
+        "stored_size": read.stored_size,
+        "notes": recording.notes,
+        "returns": _returns(read.rewards),
+    }
+    return Demonstrations(
+        read.frames, read.num_frames, read.actions, read.rewards, metadata
+    )
 
 
 @functools.cache
@@ -427,6 +371,53 @@ def _model_sizes(task: str) -> dict[str, int]:
     ) as environment:
         sizes = {name: len(x) for name, x in environment.simulator_state().items()}
         return {**sizes, "actions": environment.action_spec().shape[0]}
+
+
+def _warn_of_pixels(
+    path: pathlib.Path, loaded: Demonstrations, *, task: str, action_repeat: int
+) -> None:
+    """Says what of a foreign file can't match the agent's own view."""
+    metadata, size = loaded.metadata, loaded.frames.shape[2]
+    height, width = metadata["stored_size"]
+    _logger.warning(
+        "%s (%s) holds pixels of a renderer that is not this one: what the agent sees "
+        "may differ in light, colour and camera.",
+        path,
+        metadata["kind"],
+    )
+    if (height, width) != (size, size):
+        squeezed = "" if height == width else ", squeezed into a square"
+        _logger.warning(
+            "%s: frames of %dx%d pixels are resized to %dx%d%s.",
+            path,
+            width,
+            height,
+            size,
+            size,
+            squeezed,
+        )
+    repeat = metadata["action_repeat"]
+    if repeat is not None and repeat != action_repeat:
+        _logger.warning(
+            "%s was recorded with action_repeat=%d, and the run has %d: set "
+            "action_repeat or demonstrations.frame_skip so that they agree.",
+            path,
+            repeat,
+            action_repeat,
+        )
+    speed = metadata["frames_per_second"]
+    wanted = 1.0 / environments.decision_seconds(task, action_repeat)
+    if speed is not None and abs(speed / wanted - 1.0) > _RATE_TOLERANCE:
+        _logger.warning(
+            "%s has %.3g frames per second, and the agent decides %.3g times: set "
+            "demonstrations.frame_skip, now such that about %.3g frames make one.",
+            path,
+            speed,
+            wanted,
+            speed / wanted,
+        )
+    for note in metadata["notes"]:
+        _logger.warning("%s: %s", path, note)
 
 
 def _warn_of_versions(path: pathlib.Path, recorded: dict[str, str]) -> None:

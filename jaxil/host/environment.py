@@ -62,6 +62,14 @@ def camera_of(task: str) -> int:
     return _CAMERAS.get(split_task(task)[0], 0)
 
 
+@functools.cache
+def decision_seconds(task: str, action_repeat: int) -> float:
+    """Returns the simulated time between two decisions of the agent, in seconds."""
+    from dm_control import suite
+
+    return suite.load(*split_task(task)).control_timestep() * action_repeat
+
+
 def simulator_versions() -> dict[str, str]:
     """Returns the versions of the packages that physics and pixels depend on."""
     return {

@@ -1,4 +1,4 @@
-"""The one live line of a run: how far, how fast, where the time goes, how well."""
+"""The one live line of whatever takes long: how far, how fast, how long still."""
 
 import sys
 import time
@@ -21,6 +21,8 @@ class ProgressLine:
         total_frames: int,
         *,
         first_frame: int = 0,
+        label: str = "",
+        unit: str = "frames",
         stream: TextIO | None = None,
         window_seconds: float = 60.0,
         clock: Callable[[], float] = time.monotonic,
@@ -30,11 +32,15 @@ class ProgressLine:
         Args:
           total_frames: environment frames at the run's end, >= 1.
           first_frame: frame at which this process starts (not 0 after a resume).
+          label: a few words for the line's beginning.
+          unit: what is counted, if not environment frames.
           stream: where to write; stderr when None.
           window_seconds: longest time that speed and split are taken over.
           clock: seconds from any origin, for tests.
         """
         self._total_frames = total_frames
+        self._label = f"{label}: " if label else ""
+        self._unit = unit
         self._stream = sys.stderr if stream is None else stream
         self._live = self._stream.isatty()
         self._clock = clock
@@ -104,8 +110,8 @@ class ProgressLine:
         speed = (frame - first_frame) / elapsed
         percent = 100 * frame / self._total_frames
         parts = [
-            f"{frame}/{self._total_frames} frames ({percent:.1f} %)",
-            f"{speed:.0f} frames/s" if speed >= 10 else f"{speed:.1f} frames/s",
+            f"{self._label}{frame}/{self._total_frames} {self._unit} ({percent:.1f} %)",
+            f"{speed:.{0 if speed >= 10 else 1}f} {self._unit}/s",
         ]
         if seconds:
             shares = {

@@ -33,10 +33,12 @@ def cosine_cost(x: Array, y: Array) -> Array:
     return jnp.clip(1.0 - cosine, 0.0, 2.0)
 
 
-def sinkhorn_plan(cost: Array, *, epsilon: float, num_iterations: int) -> Array:
-    """Returns the entropic transport plan between uniform marginals.
+def sinkhorn_plan(
+    cost: Array, expert_mass: Array, *, epsilon: float, num_iterations: int
+) -> Array:
+    """Returns the entropic transport plan from uniform moments of the agent.
 
-        P = argmin <P, C> - epsilon * H(P)   with   P 1 = 1/T,  P^T 1 = 1/N
+        P = argmin <P, C> - epsilon * H(P)   with   P 1 = 1/T,  P^T 1 = b
 
     In the log domain: exp(-C / epsilon) underflows in float32 at the epsilon that
     imitation needs. The iterations end on the rows, so each moment of the agent
@@ -45,6 +47,8 @@ def sinkhorn_plan(cost: Array, *, epsilon: float, num_iterations: int) -> Array:
 
     Args:
       cost: pairwise costs. Shape [T, N].
+      expert_mass: b, what each moment of the expert carries, see `uniform_mass`; sums
+        to one. Shape [N].
       epsilon: weight of the entropy, in units of cost.
       num_iterations: Sinkhorn iterations; static under jit.
 
@@ -59,9 +63,10 @@ def sinkhorn_plan(cost: Array, *, epsilon: float, num_iterations: int) -> Array:
     from ott.problems.linear import linear_problem
     from ott.solvers.linear import sinkhorn
 
-    chex.assert_rank(cost, 2)
+    chex.assert_rank([cost, expert_mass], [2, 1])
+    chex.assert_equal_shape_suffix([cost, expert_mass], 1)
     problem = linear_problem.LinearProblem(
-        geometry.Geometry(cost_matrix=cost, epsilon=epsilon)
+        geometry.Geometry(cost_matrix=cost, epsilon=epsilon), b=expert_mass
     )
     solver = sinkhorn.Sinkhorn(
         lse_mode=True,
@@ -74,6 +79,23 @@ def sinkhorn_plan(cost: Array, *, epsilon: float, num_iterations: int) -> Array:
     # Its measure of the marginals' error promotes ranks, which tests forbid.
     with jax.numpy_rank_promotion("allow"):
         return solver(problem).matrix
+
+
+def uniform_mass(num_moments: Array, length: int) -> Array:
+    """Shares a mass of one out over an episode's own moments.
+
+        b_n = 1 / num_moments for n < num_moments, else 0
+
+    Args:
+      num_moments: shape [].
+      length: N, with what fills an episode up to the length of others.
+
+    Returns:
+      Masses. Shape [N].
+    """
+    chex.assert_rank(num_moments, 0)
+    own = jnp.arange(length) < num_moments
+    return jnp.where(own, 1.0 / num_moments, 0.0)
 
 
 def transport_rewards(cost: Array, plan: Array) -> Array:

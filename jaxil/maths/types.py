@@ -64,9 +64,12 @@ class ExpertEpisodes(NamedTuple):
     """The demonstrations, frames not stacked.
 
     Attributes:
-      frames: uint8 [K, N + 1, H, W, 3], or float32 [K, N + 1, S].
-      actions: shape [K, N, A].
+      frames: uint8 [K, N + 1, H, W, 3], or float32 [K, N + 1, S]. A shorter episode
+        repeats its last frame.
+      num_frames: how many of them are the episode's own. Shape [K].
+      actions: shape [K, N, A]; [K, 0, 0] where they are not known.
     """
 
     frames: Data
+    num_frames: Data
     actions: Data

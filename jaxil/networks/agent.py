@@ -44,7 +44,7 @@ def make_agent_networks(
       mean: see `PixelEncoder`.
     """
     if observation == "state":
-        encoder = StateEncoder()
+        encoder = StateEncoder(hidden_dim)
     else:
         encoder = PixelEncoder(channels, kernel_sizes, strides, contrast, mean)
     return AgentNetworks(

@@ -106,7 +106,7 @@ def make_sinkhorn_rewarder(
     ) -> tuple[Array, SinkhornState]:
         assert expert_episodes is not None
         chex.assert_equal_shape_prefix(
-            [expert_episodes.frames, expert_episodes.actions], 1
+            [expert_episodes.frames, expert_episodes.num_frames], 1
         )
         num_steps = jnp.asarray(episode.actions.shape[0], jnp.int32)
         state = state.replace(steps_since_copy=state.steps_since_copy + num_steps)
@@ -120,8 +120,11 @@ def make_sinkhorn_rewarder(
         costs = jax.vmap(transport.cosine_cost, in_axes=(None, 0))(
             features, state.expert_features
         )
+        masses = jax.vmap(transport.uniform_mass, in_axes=(0, None))(
+            expert_episodes.num_frames, costs.shape[2]
+        )
         unscaled = closest_rewards(
-            costs, epsilon=epsilon, num_iterations=num_iterations
+            costs, masses, epsilon=epsilon, num_iterations=num_iterations
         )[1:]
         first_scale = return_scale / jnp.maximum(-jnp.sum(unscaled), _COST_FLOOR)
         scale = jnp.where(state.scale > 0.0, state.scale, first_scale)
@@ -137,7 +140,9 @@ def make_sinkhorn_rewarder(
     )
 
 
-def closest_rewards(costs: Array, *, epsilon: float, num_iterations: int) -> Array:
+def closest_rewards(
+    costs: Array, expert_masses: Array, *, epsilon: float, num_iterations: int
+) -> Array:
     """Returns transport rewards to the demonstration that is cheapest to reach.
 
         k* = argmin_k <C_k, P_k>,    r_t = - sum_n C_k*tn P_k*tn
@@ -147,6 +152,7 @@ def closest_rewards(costs: Array, *, epsilon: float, num_iterations: int) -> Arr
 
     Args:
       costs: one matrix for each demonstration. Shape [K, T, N].
+      expert_masses: what each of its moments carries. Shape [K, N].
       epsilon: weight of the entropy, in units of cost.
       num_iterations: of Sinkhorn.
 
@@ -155,13 +161,13 @@ def closest_rewards(costs: Array, *, epsilon: float, num_iterations: int) -> Arr
 
     Source: Cohen et al. 2021, eq. (5); siddhanthaldar/ROT, agent/potil.py.
     """
-    chex.assert_rank(costs, 3)
+    chex.assert_rank([costs, expert_masses], [3, 2])
 
-    def solve(cost: Array) -> Array:
+    def solve(cost: Array, expert_mass: Array) -> Array:
         plan = transport.sinkhorn_plan(
-            cost, epsilon=epsilon, num_iterations=num_iterations
+            cost, expert_mass, epsilon=epsilon, num_iterations=num_iterations
         )
         return transport.transport_rewards(cost, plan)
 
-    candidates = jax.vmap(solve)(costs)
+    candidates = jax.vmap(solve)(costs, expert_masses)
     return candidates[jnp.argmax(jnp.sum(candidates, axis=1))]

@@ -479,7 +479,9 @@ def test_compiles_once_and_donates_its_state(rewarder, expert):
     rng = np.random.default_rng(0)
     frames = rng.integers(0, 256, (3, 4, SIDE, SIDE, CHANNELS // 2), dtype=np.uint8)
     episode = Episode(frames[0], np.zeros((3, ACTIONS), np.float32), np.zeros(3))
-    experts = ExpertEpisodes(frames[1:], np.zeros((2, 3, ACTIONS), np.float32))
+    experts = ExpertEpisodes(
+        frames[1:], np.array([4, 4]), np.zeros((2, 3, ACTIONS), np.float32)
+    )
     for seed in range(3):
         old = state
         state, _ = step(

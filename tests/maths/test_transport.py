@@ -20,7 +20,11 @@ with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
 
 
 def plan_of(cost, *, epsilon=0.1, num_iterations=200):
-    return transport.sinkhorn_plan(cost, epsilon=epsilon, num_iterations=num_iterations)
+    length = cost.shape[-1]
+    mass = transport.uniform_mass(jnp.asarray(length), length)
+    return transport.sinkhorn_plan(
+        cost, mass, epsilon=epsilon, num_iterations=num_iterations
+    )
 
 
 solve = jax.jit(plan_of, static_argnames=("epsilon", "num_iterations"))

@@ -12,6 +12,7 @@ from jax import lax
 
 from jaxil.networks.agent import apply
 from jaxil.networks.encoder import PixelEncoder, StateEncoder
+from jaxil.networks.layers import Trunk
 
 with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
 
@@ -113,12 +114,24 @@ def test_kernels_are_orthogonal_with_gain_root_two_and_biases_zero():
         np.testing.assert_array_equal(layer["bias"], np.zeros(8))
 
 
-def test_state_vectors_pass_unchanged():
-    encoder = StateEncoder()
-    vectors = np.random.default_rng(0).normal(size=(3, 5)).astype(np.float32)
-    params = encoder.init(jax.random.key(0), vectors)
-    assert not jax.tree.leaves(params)
-    np.testing.assert_array_equal(apply(encoder, params, vectors), vectors)
+def test_a_state_vectors_scale_reaches_the_trunk():
+    # Two states that differ in nothing but scale: straight into the trunk, its
+    # LayerNorm would make them one.
+    encoder, trunk = StateEncoder(16), Trunk(8)
+    state = jnp.array([[0.5, -3.0, 12.0]])
+    states = jnp.concatenate([state, 2.0 * state, 0.0 * state])
+    params = encoder.init(jax.random.key(0), states)
+    representation = apply(encoder, params, states)
+    chex.assert_shape(representation, (3, 16))
+    assert np.min(np.asarray(representation)) >= 0.0
+    trunk_params = trunk.init(jax.random.key(1), states)
+    bare = np.asarray(apply(trunk, trunk_params, states))
+    np.testing.assert_allclose(bare[0], bare[1], atol=1e-3)
+    params = jax.tree.map(lambda x: x + 0.1, params)  # biases are no longer zero
+    representation = apply(encoder, params, states)
+    trunk_params = trunk.init(jax.random.key(1), representation)
+    features = np.asarray(apply(trunk, trunk_params, representation))
+    assert np.abs(features[0] - features[1]).max() > 0.05
 
 
 def test_an_image_without_batch_is_rejected():

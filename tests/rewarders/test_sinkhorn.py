@@ -69,11 +69,19 @@ def make_episode(frames):
 
 def make_experts(seed=50):
     return ExpertEpisodes(
-        random_frames(seed, K, EXPERT_STEPS + 1), np.zeros((K, EXPERT_STEPS, 2))
+        random_frames(seed, K, EXPERT_STEPS + 1),
+        np.full(K, EXPERT_STEPS + 1),
+        np.zeros((K, EXPERT_STEPS, 2)),
     )
 
 
-solve = jax.jit(closest_rewards, static_argnames=("epsilon", "num_iterations"))
+@functools.partial(jax.jit, static_argnames=("epsilon", "num_iterations"))
+def solve(costs, *, epsilon, num_iterations):
+    """Rewards to demonstrations of one length."""
+    masses = jnp.full((costs.shape[0], costs.shape[2]), 1.0 / costs.shape[2])
+    return closest_rewards(
+        costs, masses, epsilon=epsilon, num_iterations=num_iterations
+    )
 
 
 def start(rewarder, params):
@@ -154,6 +162,7 @@ def test_reward_t_is_of_observation_t_plus_1(special):
     plain = random_frames(1, 1)[0]
     experts = ExpertEpisodes(
         np.broadcast_to(plain, (K, EXPERT_STEPS + 1, *plain.shape)),
+        np.full(K, EXPERT_STEPS + 1),
         np.zeros((K, EXPERT_STEPS, 2)),
     )
     # A first episode sets the scale, so that this one's is not taken up with it.
@@ -182,12 +191,42 @@ def test_rewards_step_by_step(frame_stack):
         cost = transport.cosine_cost(
             features(jnp.asarray(frames)), features(jnp.asarray(demonstration))
         )
-        plan = transport.sinkhorn_plan(cost, epsilon=0.01, num_iterations=50)
+        mass = np.full(EXPERT_STEPS + 1, 1.0 / (EXPERT_STEPS + 1), np.float32)
+        plan = transport.sinkhorn_plan(cost, mass, epsilon=0.01, num_iterations=50)
         candidates.append(-np.sum(np.asarray(cost) * np.asarray(plan), axis=1))
     best = max(candidates, key=np.sum)[1:]
     rewards = first_rewards(params, frames, experts, frame_stack)
     assert len(rewards) == STEPS
     np.testing.assert_allclose(rewards, best * 10.0 / -np.sum(best), rtol=1e-3)
+
+
+def test_what_fills_a_short_demonstration_up_counts_for_nothing():
+    # The same demonstrations, once alone and once filled up to twice their length with
+    # frames that would be far cheaper to reach: the agent's own.
+    params, experts = make_params(0), make_experts()
+    frames = random_frames(1, STEPS + 1)
+    filled = np.concatenate([experts.frames, experts.frames], axis=1)
+    filled[:, EXPERT_STEPS + 1 :] = frames[0]
+    longer = experts._replace(frames=filled)
+    spec = SPEC._replace(expert_steps=filled.shape[1] - 1)
+    rewarder = make_rewarder()
+    rewards, _ = rewarder.rewards(
+        rewarder.init(jax.random.key(0), spec, params),
+        params,
+        make_episode(frames),
+        longer,
+    )
+    np.testing.assert_allclose(
+        rewards, first_rewards(params, frames, experts), rtol=1e-4
+    )
+    with_filling = longer._replace(num_frames=np.full(K, filled.shape[1]))
+    other, _ = rewarder.rewards(
+        rewarder.init(jax.random.key(0), spec, params),
+        params,
+        make_episode(frames),
+        with_filling,
+    )
+    assert np.abs(other - rewards).max() > 1e-2
 
 
 def test_reads_the_actors_trunk_and_nothing_of_the_critic():
@@ -239,7 +278,7 @@ def test_the_first_episode_sets_the_scale_for_good():
 def test_a_perfect_first_episode_leaves_the_scale_finite():
     rewarder, params, experts = make_rewarder(), make_params(0), make_experts()
     black = np.zeros((STEPS + 1, SIDE, SIDE, 3), np.uint8)
-    experts = ExpertEpisodes(np.zeros_like(experts.frames), experts.actions)
+    experts = experts._replace(frames=np.zeros_like(experts.frames))
     rewards, state = rewarder.rewards(
         start(rewarder, params), params, make_episode(black), experts
     )

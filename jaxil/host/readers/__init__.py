@@ -1,0 +1,1 @@
+"""Other people's demonstration files, one module for each format."""

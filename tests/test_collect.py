@@ -1,0 +1,192 @@
+"""`collect`: recording, showing and converting, as people type it."""
+
+import itertools
+import os
+import signal
+import subprocess
+import time
+
+import imageio.v3
+import numpy as np
+import pytest
+
+from jaxil import collect, inspection
+from jaxil.command import UsageError
+from jaxil.host import demonstrations, foreign, states
+from tests.commands import ROOT, arguments, run
+from tests.host import foreign_files
+
+SHIPPED = states.shipped_path("cartpole_swingup")
+SIZES = ("--image_size=16", "--render_quality=fast")
+
+
+@pytest.fixture(name="few")
+def _few(tmp_path):
+    """The first 8 steps of two shipped episodes."""
+    stored = states.read_states(SHIPPED, num_episodes=2)
+    short = stored._replace(
+        qpos=stored.qpos[:, :9],
+        qvel=stored.qvel[:, :9],
+        act=stored.act[:, :9],
+        actions=stored.actions[:, :8],
+        rewards=stored.rewards[:, :8],
+    )
+    path = tmp_path / "few.npz"
+    states.write_states(path, short)
+    return path
+
+
+def call(*flags: str) -> None:
+    collect.main(["collect", *map(str, flags)])
+
+
+# --- showing --------------------------------------------------------------------------
+
+
+def test_states_are_shown_as_table_sheet_and_video(few, tmp_path, capsys):
+    folder = tmp_path / "shown"
+    folder.mkdir()
+    call(f"--inspect={few}", f"--output={folder}", *SIZES)
+    printed = capsys.readouterr().out
+    for words in ("format: jaxil states", "task: cartpole_swingup", "episodes: 2"):
+        assert words in printed
+    assert {path.name for path in folder.iterdir()} == {"few_sheet.png", "few.mp4"}
+    sheet = imageio.v3.imread(folder / "few_sheet.png")
+    # Two rows of eight pictures, 96 pixels wide at least, with something on them.
+    assert sheet.shape[1] > 8 * 96
+    assert sheet.std() > 5
+
+
+@pytest.mark.parametrize("name", ["pickle", "replays", "video", "lerobot", "minari"])
+def test_every_format_is_shown(name, tmp_path, capsys):
+    if name == "minari":
+        pytest.importorskip("minari")
+    source = tmp_path / "source"
+    getattr(foreign_files, f"write_{name}")(source, 0)
+    call(f"--inspect={source}", f"--output={tmp_path}")
+    printed = capsys.readouterr().out
+    recording = foreign.open_recording(source, max_bytes=2**30)
+    assert f"format: {recording.kind}" in printed
+    assert f"episodes: {recording.num_episodes}" in printed
+    assert (tmp_path / "source_sheet.png").stat().st_size > 0
+    assert (tmp_path / "source.mp4").stat().st_size > 0
+
+
+def test_the_sheet_shows_an_episode_from_first_to_last_frame():
+    # Frame t is of brightness 10 t: eight pictures of fifteen frames, evenly spaced.
+    brightness = np.arange(15, dtype=np.uint8) * 10
+    frames = np.broadcast_to(brightness[:, None, None, None], (15, 4, 4, 3))
+    summary = inspection.EpisodeSummary(15, 4, 4, None, None)
+    seen = inspection.Inspection(
+        "x", {}, [summary], [frames[inspection._spaced(15)]], frames, 10.0
+    )
+    sheet = np.asarray(inspection.contact_sheet(seen))
+    row = sheet[-20, :, 0]  # a line through the pictures
+    shown = [value for value, _ in itertools.groupby(row.tolist()) if value != 24]
+    assert shown == [0, 20, 40, 60, 80, 100, 120, 140]
+
+
+# --- converting -----------------------------------------------------------------------
+
+
+def test_states_become_pixels_that_serve_as_the_states_do(few, tmp_path, capsys):
+    output = tmp_path / "pixels.npz"
+    call("--convert", few, output, *SIZES)
+    assert "2 episodes of jaxil states" in capsys.readouterr().out
+    settings = {
+        "task": "cartpole_swingup",
+        "num_episodes": 2,
+        "action_repeat": 2,
+        "image_size": 16,
+        "render_quality": "fast",
+    }
+    one, other = (demonstrations.load(path, **settings) for path in (few, output))
+    np.testing.assert_array_equal(one.frames, other.frames)
+    np.testing.assert_array_equal(one.actions, other.actions)
+    np.testing.assert_allclose(
+        one.metadata["returns"], other.metadata["returns"], rtol=1e-6
+    )
+    assert other.metadata["frames_per_second"] == pytest.approx(50.0)
+
+
+def test_pixels_keep_their_size_unless_another_is_asked_for(tmp_path):
+    source, output = tmp_path / "source", tmp_path / "out.npz"
+    foreign_files.write_pickle(source, 0)
+    stored = next(foreign.open_recording(source, max_bytes=2**30).episodes).frames
+    call(f"--convert={source}", f"--output={output}", "--frame_skip=2")
+    kept = next(foreign.open_recording(output, max_bytes=2**30).episodes).frames
+    np.testing.assert_array_equal(
+        kept, stored[: len(stored) // 2 * 2 + 1 : 2][: len(kept)]
+    )
+    call(f"--convert={source}", f"--output={output}", "--image_size=10")
+    small = next(foreign.open_recording(output, max_bytes=2**30).episodes).frames
+    assert small.shape == (len(stored), 10, 10, 3)
+
+
+# --- wrong use ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ([], "exactly one of --workdirs, --inspect, --convert"),
+        ([], "--output is missing"),
+        (["--inspect=a", "--convert=b", "--output=c"], "given: --inspect, --convert"),
+        (["--convert=a"], "--output is missing"),
+        (["--convert=a", "--output=."], "is a folder"),
+        (["--inspect=none.npz"], "none.npz cannot be read"),
+        (["--inspect=setup.cfg"], "in no format that is read"),
+        (["--inspect=setup.cfg", "--output=setup.cfg"], "must be a folder"),
+        (["--convert=setup.cfg", "--output=x.npz"], "in no format that is read"),
+        (["--convert", "a", "b", "c"], "'c' is not a flag"),
+        (["--inspect=a", "--image_size=2"], "image_size"),
+        (["--inspect=a", "--render_quality=good"], "render_quality"),
+    ],
+)
+def test_wrong_use_is_said_in_one_message(flags, expected, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    with pytest.raises(UsageError) as caught:
+        call(*flags)
+    assert expected in str(caught.value)
+
+
+def test_wrong_use_ends_with_status_2_and_no_traceback(tmp_path):
+    damaged = tmp_path / "demos.npz"
+    damaged.write_bytes(SHIPPED.read_bytes()[:5000])
+    finished = run("collect", f"--inspect={damaged}")
+    assert finished.returncode == 2
+    assert str(damaged) in finished.stderr
+    assert "Traceback" not in finished.stderr
+
+
+def test_killed_while_writing_leaves_the_old_file_or_the_new_one(few, tmp_path):
+    # Killed at moments spread over the command's life: the file is always whole.
+    output = tmp_path / "pixels.npz"
+    command = arguments("collect", f"--convert={SHIPPED}", f"--output={output}", *SIZES)
+    output.write_bytes(few.read_bytes())
+    started = time.monotonic()
+    process = subprocess.Popen(
+        command, cwd=ROOT, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+    )
+    kills = 0
+    while process.poll() is None:
+        # Begun to write: a temporary file is there.
+        if list(tmp_path.glob("*.part")) and kills < 4:
+            time.sleep(0.1 + 0.3 * kills)
+            os.kill(process.pid, signal.SIGKILL)
+            process.wait()
+            kills += 1
+            assert output.read_bytes() == few.read_bytes()
+            for part in tmp_path.glob("*.part"):
+                part.unlink()
+            if kills < 3:
+                process = subprocess.Popen(
+                    command,
+                    cwd=ROOT,
+                    stderr=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                )
+        time.sleep(0.02)
+        assert time.monotonic() - started < 200
+    assert kills >= 1
+    assert states.read_states(output).rewards.shape == (2, 8)
