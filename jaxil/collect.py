@@ -121,7 +121,6 @@ def _inspect(values: flags.FlagValues) -> None:
         raise command.UsageError(
             f"--inspect={path} cannot be read ({error.strerror or error})"
         ) from error
-    print(inspection.table(seen))
     name = path.resolve().stem
     folder = pathlib.Path(values.output or ".")
     sheet, video = folder / f"{name}_sheet.png", folder / f"{name}.mp4"
@@ -132,6 +131,8 @@ def _inspect(values: flags.FlagValues) -> None:
         write_video(video, seen.video, fps=seen.frames_per_second, labels=(name, ""))
     except OSError as error:
         raise command.UsageError(f"--output={folder}: {error}") from error
+    # Last, so that `| head` cuts nothing short.
+    print(inspection.table(seen))
     print(f"contact sheet: {sheet}\nvideo of episode 0: {video}")
 
 

@@ -8,8 +8,8 @@ import pytest
 from jaxil import config as jaxil_config
 from jaxil import doctor, platform
 from jaxil.command import UsageError
-from jaxil.host import states
 from jaxil.host import environment as environments
+from jaxil.host import states
 
 
 @pytest.fixture(autouse=True)

@@ -8,6 +8,56 @@ import imageio_ffmpeg
 import numpy as np
 
 
+def write_minari(path: pathlib.Path, seed: int) -> None:
+    """A dataset's folder as Minari writes it; too small for its JPEGs."""
+    rng = np.random.default_rng(seed)
+    episodes = []
+    for num_steps in (3, 4):
+        episodes.append(
+            {
+                "observations": _random_frames(rng, num_steps + 1),
+                "actions": rng.uniform(-1, 1, (num_steps, 2)).astype(np.float32),
+                "rewards": rng.uniform(size=num_steps),
+            }
+        )
+    write_minari_episodes(path, episodes)
+
+
+def write_minari_episodes(
+    path: pathlib.Path, episodes: list[dict], *, observation_space=None, **options
+) -> None:
+    """Writes episodes by Minari.
+
+    Args:
+      path: the dataset's folder, which is made.
+      episodes: each with observations, actions and rewards.
+      observation_space: None for images like those of the first episode.
+      **options: of Minari's storage.
+    """
+    import gymnasium
+    from minari.data_collector.episode_buffer import EpisodeBuffer
+    from minari.dataset.minari_storage import MinariStorage
+
+    if observation_space is None:
+        shape = episodes[0]["observations"].shape[1:]
+        observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
+    actions = np.asarray(episodes[0]["actions"])
+    action_space = gymnasium.spaces.Discrete(9)
+    if actions.dtype.kind == "f":
+        action_space = gymnasium.spaces.Box(-1, 1, actions.shape[1:], np.float32)
+    path.mkdir()
+    storage = MinariStorage.new(
+        path / "data",
+        observation_space=observation_space,
+        action_space=action_space,
+        **options,
+    )
+    for episode in episodes:
+        ends = [False] * len(episode["rewards"])
+        buffer = EpisodeBuffer(**episode, terminations=ends, truncations=ends, infos={})
+        storage.update_episodes([buffer])
+
+
 def write_video(path: pathlib.Path, seed: int) -> None:
     """An MP4 file of one episode, whose every pixel is kept."""
     frames = _random_frames(np.random.default_rng(seed), num_frames=5)

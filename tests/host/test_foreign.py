@@ -27,6 +27,11 @@ def make_episode(num_steps=6, size=8, seed=0, action_dim=1):
     )
 
 
+def known(array: np.ndarray | None) -> np.ndarray:
+    assert array is not None
+    return array
+
+
 def make_recording(episodes, **facts):
     return Recording("made up", len(episodes), iter(episodes), **facts)
 
@@ -178,11 +183,13 @@ def test_frame_skip_keeps_every_nth_frame_and_all_rewards(path):
     np.testing.assert_array_equal(loaded.frames[0], episodes[0].frames[::2])
     np.testing.assert_array_equal(loaded.frames[1, :3], episodes[1].frames[:5:2])
     np.testing.assert_array_equal(loaded.frames[1, 3], episodes[1].frames[4])
-    np.testing.assert_array_equal(loaded.actions[0], episodes[0].actions[::2])
-    np.testing.assert_array_equal(loaded.actions[1, :2], episodes[1].actions[:4:2])
+    actions = [known(episode.actions) for episode in episodes]
+    np.testing.assert_array_equal(known(loaded.actions)[0], actions[0][::2])
+    np.testing.assert_array_equal(known(loaded.actions)[1, :2], actions[1][:4:2])
+    rewards = [known(episode.rewards) for episode in episodes]
     np.testing.assert_allclose(
         loaded.metadata["returns"],
-        [episodes[0].rewards.sum(), episodes[1].rewards[:4].sum()],
+        [rewards[0].sum(), rewards[1][:4].sum()],
         rtol=1e-6,
     )
     with pytest.raises(DemonstrationError, match="too few for frame_skip=6"):
@@ -286,7 +293,7 @@ def test_actions_are_needed_only_where_they_are_seen(path):
     settings = {"task": TASK, "num_episodes": 1, "action_repeat": 2, "image_size": 8}
     write(path, [make_episode(action_dim=3)])
     demonstrations.check(path, **settings)
-    with pytest.raises(DemonstrationError, match="actions of 3 numbers.*needs 1"):
+    with pytest.raises(DemonstrationError, match=r"actions of 3 numbers.*needs 1"):
         demonstrations.check(path, sees_actions=True, **settings)
     write(path, [make_episode()._replace(actions=None)])
     with pytest.raises(DemonstrationError, match="holds no actions"):

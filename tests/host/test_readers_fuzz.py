@@ -59,11 +59,11 @@ class Format(NamedTuple):
 
 
 FORMATS = {
-    "pickles": Format("pickles", "write_pickle", 16, 400),
-    "replays": Format("replays", "write_replays", 4, 300),
-    "videos": Format("videos", "write_video", 2, 12),
-    "minari": Format("minari", "write_minari", 2, 60, ("h5py",)),
-    "lerobot": Format("lerobot", "write_lerobot", 2, 12, ("pyarrow",)),
+    "pickles": Format("pickles", "write_pickle", 16, 200),
+    "replays": Format("replays", "write_replays", 4, 100),
+    "videos": Format("videos", "write_video", 2, 8),
+    "minari": Format("minari", "write_minari", 2, 40, ("h5py",)),
+    "lerobot": Format("lerobot", "write_lerobot", 2, 8, ("pyarrow",)),
 }
 
 

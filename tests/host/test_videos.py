@@ -312,7 +312,8 @@ def test_a_reference_to_another_file_is_not_followed(path):
 
 
 def run(code):
-    return child.Child([sys.executable, "-c", code], cpu_seconds=1.0)
+    command = [sys.executable, "-c", code]
+    return child.Child(command, cpu_seconds=1.0, memory_bytes=2**30)
 
 
 def test_a_program_that_computes_for_ever_is_stopped():

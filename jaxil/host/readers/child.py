@@ -18,8 +18,7 @@ from typing import IO
 
 from jaxil.host.readers.recording import FormatError
 
-_MEMORY_BYTES = 1024**3  # what a child may fill beyond what its task needs
-_WAIT_SECONDS = 10.0  # on top of twice its own time: others use the machine, too
+_WAIT_SECONDS = 60.0  # on top of twice its own time: others use the machine, too
 _MAX_SAID = 4096  # bytes of complaints that are kept
 
 
@@ -35,7 +34,7 @@ class Child:
         command: Sequence[str | os.PathLike],
         *,
         cpu_seconds: float,
-        memory_bytes: int = 0,
+        memory_bytes: int,
         stdin: IO[bytes] | int = subprocess.DEVNULL,
         env: Mapping[str, str] | None = None,
     ):
@@ -44,7 +43,7 @@ class Child:
         Args:
           command: the program and its arguments.
           cpu_seconds: how long it may compute.
-          memory_bytes: what its task needs; the program itself has a gigabyte more.
+          memory_bytes: how much it may fill.
           stdin: what it reads.
           env: its environment variables; None for ours.
         """
@@ -63,7 +62,7 @@ class Child:
         assert self._process.stdout is not None
         assert self._process.stderr is not None
         self._limit(resource.RLIMIT_CPU, max(round(cpu_seconds), 1))
-        self._limit(resource.RLIMIT_DATA, _MEMORY_BYTES + memory_bytes)
+        self._limit(resource.RLIMIT_DATA, memory_bytes)
         self._limit(resource.RLIMIT_CORE, 0)
         self._stdout = self._process.stdout.fileno()
         self._stderr = self._process.stderr.fileno()

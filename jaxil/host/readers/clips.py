@@ -19,6 +19,7 @@ from jaxil.host.readers.recording import FormatError
 _CPU_SECONDS = 1.0  # for a tiny file
 _BYTES_PER_SECOND = 5e6  # of the file, read on a slow machine
 _PIXEL_BYTES_PER_SECOND = 1e7  # decoded there
+_MEMORY_BYTES = 1024**3  # enough for ffmpeg at 3840x2160 pixels
 _UNEVEN = 1.5  # longest time between two frames, over the shortest
 
 
@@ -209,7 +210,9 @@ def _ffmpeg(path: pathlib.Path, output: Sequence[str], cpu_seconds: float) -> Ch
     command += ["-loglevel", "error", "-protocol_whitelist", "fd", "-threads", "1"]
     command += ["-f", parser, "-fd", "0", "-i", "fd:", "-map", "0:V:0", *output, "-"]
     with path.open("rb") as file:
-        return Child(command, cpu_seconds=cpu_seconds, stdin=file)
+        return Child(
+            command, cpu_seconds=cpu_seconds, memory_bytes=_MEMORY_BYTES, stdin=file
+        )
 
 
 def _check_end(child: Child) -> None:

@@ -1,4 +1,4 @@
-"""What a pickle of arrays is made of: names, types and arrays, none of them NumPy's.
+"""What a pickle of arrays is made of: types and arrays, none of them NumPy's.
 
 NumPy's own functions, given damaged or hostile arguments, allocate without bound or
 crash the interpreter; here their arguments are only compared with each other.
@@ -7,43 +7,17 @@ Source of the arguments: numpy/numpy, `__reduce__` of arrays, types and scalars.
 """
 
 import dataclasses
-import enum
 import math
 import re
 from typing import Any, BinaryIO
 
 import numpy as np
 
+from jaxil.host.readers.pickle_names import Name
 from jaxil.host.readers.recording import FormatError
 
 _MAX_AXES = 32
 _NUMBERS = re.compile(r"b1|[iu][1248]|f[248]")
-
-
-class Name(enum.Enum):
-    """What a pickle of arrays may name; none of it is looked up."""
-
-    RECONSTRUCT = "numpy.core.multiarray._reconstruct"
-    FROM_BUFFER = "numpy.core.numeric._frombuffer"
-    SCALAR = "numpy.core.multiarray.scalar"
-    NDARRAY = "numpy.ndarray"
-    DTYPE = "numpy.dtype"
-    ENCODE = "_codecs.encode"
-    BYTES = "builtins.bytes"
-
-
-_OTHER_NAMES = {
-    "builtins.bytearray": Name.BYTES,
-    "__builtin__.bytes": Name.BYTES,
-    "__builtin__.bytearray": Name.BYTES,
-    # NumPy 1.16.0 wrote the name of the compiled module, NumPy 2 renames the package.
-    "numpy.core._multiarray_umath._reconstruct": Name.RECONSTRUCT,
-    "numpy.core._multiarray_umath.scalar": Name.SCALAR,
-    "numpy._core.multiarray._reconstruct": Name.RECONSTRUCT,
-    "numpy._core.multiarray.scalar": Name.SCALAR,
-    "numpy._core.numeric._frombuffer": Name.FROM_BUFFER,
-}
-_NAMES = {name.value: name for name in Name} | _OTHER_NAMES
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +44,9 @@ class Blob:
         if not self.is_text:
             return content
         try:
-            return content.decode("utf-8").encode("latin-1")
+            text = content.decode("utf-8")
+            del content  # the three of them may be large
+            return text.encode("latin-1")
         except UnicodeError as error:
             raise FormatError("has text in the place of an array's bytes") from error
 
@@ -134,21 +110,6 @@ class Array:
             raise FormatError("has an array that is not as long as it says")
         values = np.frombuffer(data, self.dtype).reshape(self.stored_shape)
         return values.transpose(self.axes)
-
-
-def named(module: str, name: str) -> Name:
-    """Returns what a pickle imports.
-
-    Raises:
-      FormatError: no array needs it.
-    """
-    try:
-        return _NAMES[f"{module}.{name}"]
-    except KeyError:
-        raise FormatError(
-            f"imports {ascii(f'{module}.{name}')[1:-1][:80]}, which a demonstration "
-            "needs not: nothing was executed"
-        ) from None
 
 
 def called(function: Any, arguments: tuple[Any, ...]) -> Any:

@@ -13,7 +13,8 @@ import struct
 from collections.abc import Callable
 from typing import Any, BinaryIO
 
-from jaxil.host.readers.pickle_values import Blob, called, named, set_state
+from jaxil.host.readers.pickle_names import named
+from jaxil.host.readers.pickle_values import Blob, called, set_state
 from jaxil.host.readers.recording import FormatError
 
 PROTOCOLS = range(2, 6)
