@@ -80,7 +80,7 @@ def test_acrobot_regulator_holds_what_falls_alone(environment):
     gains = np.array([[1.0, 1, 0, 1, 0, 1, 1, 30]]).T
     start = tuple(np.array([[0.005], [-0.005], [0.0], [0.0]]))
     held = fallen = start
-    for _ in range(600):
+    for _ in range(400):
         held = arm.step(held, planner.control(arm, held, gains))
         fallen = arm.step(fallen, np.zeros(1))
     assert np.abs(held).max() < 1e-3
@@ -104,8 +104,9 @@ def test_acrobot_search_never_gives_up_better_gains(environment):
     assert middling[0] == pytest.approx(coming, rel=0.1)  # in 1.2 s chaos is small
 
 
-def test_acrobot_record_is_what_its_actions_do(environment, tmp_path):
+def test_acrobot_record_is_what_its_actions_do(environment, tmp_path, monkeypatch):
     acrobot = importlib.import_module("acrobot")
+    monkeypatch.setattr(acrobot, "_SEARCH_EVERY_STEPS", 250)  # for speed
     effort = acrobot.Effort(draws=300, variations=100, rounds=1, exact=10)
     path = tmp_path / "acrobot.npz"
     states.write_states(path, acrobot.record(1, first=effort, later=effort))

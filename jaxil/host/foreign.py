@@ -8,8 +8,8 @@ import numpy as np
 from PIL import Image
 
 from jaxil.host.readers import (
-    # lerobot,
-    # minari,
+    lerobot,
+    minari,
     own,
     pickles,
     replays,
@@ -19,7 +19,7 @@ from jaxil.host.readers.recording import FormatError, PixelEpisode, Recording
 from jaxil.host.readers.validation import check_episode
 
 # Asked in this order; each decides by content.
-_READERS: tuple[Any, ...] = (own, pickles, videos, replays)
+_READERS: tuple[Any, ...] = (own, pickles, videos, minari, lerobot, replays)
 FORMATS = (
     "jaxil states or pixels (.npz), ROT or PatchAIL pickles, folders of DrQ-v2 or "
     "V-D4RL episodes (.npz), videos (mp4, gif, webm), Minari and LeRobot v3 datasets"

@@ -8,7 +8,7 @@ import itertools
 import os
 import pathlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from typing import IO, NamedTuple
 
 import numpy as np
@@ -55,8 +55,15 @@ def parser_of(path: pathlib.Path) -> str | None:
     return "matroska" if start.startswith(b"\x1aE\xdf\xa3") else None
 
 
-def probe(path: pathlib.Path, *, max_bytes: int, frame_skip: int = 1) -> Clip:
+def probe(
+    path: pathlib.Path, *, max_bytes: int | None = None, frame_skip: int = 1
+) -> Clip:
     """Reads size, times and number of a video's frames; decodes none of them.
+
+    Args:
+      path: the file.
+      max_bytes: of all frames that are kept; None where they are not all to be kept.
+      frame_skip: every n-th frame is kept.
 
     Raises:
       FormatError: it is no video or damaged, would fill more than `max_bytes`, or has
@@ -81,7 +88,8 @@ def probe(path: pathlib.Path, *, max_bytes: int, frame_skip: int = 1) -> Clip:
                     raise FormatError("is damaged: its frames lie over one another")
                 if found[1] != b"NOPTS":
                     times.append(int(found[1]))
-                check_size(-(-num_packets // frame_skip), height, width, max_bytes)
+                if max_bytes is not None:
+                    check_size(-(-num_packets // frame_skip), height, width, max_bytes)
         _check_end(child)
     if parser_of(path) == "gif" and _gif_frames(path) != num_packets:
         raise FormatError(f"is damaged after {num_packets} frames")
@@ -100,7 +108,7 @@ def probe(path: pathlib.Path, *, max_bytes: int, frame_skip: int = 1) -> Clip:
 
 def decode(
     path: pathlib.Path, *, max_frame_bytes: int, cpu_seconds: float
-) -> Iterator[np.ndarray]:
+) -> Generator[np.ndarray, None, None]:
     """Decodes a video frame by frame, as they are asked for.
 
     Args:

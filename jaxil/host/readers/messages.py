@@ -20,12 +20,12 @@ import numpy as np
 from jaxil.host.readers.child import Child
 from jaxil.host.readers.recording import FormatError
 
-_CPU_SECONDS = 3.0  # for a tiny file; about half a second of it is for the imports
+_CPU_SECONDS = 2.0  # for a tiny file; about half a second of it is for the imports
 _BYTES_PER_SECOND = 5e5  # of a file, read on a slow machine, however compressed
 _MEMORY_BYTES = 512 * 1024**2  # of the libraries
 _MAX_LINE = 10**6
 _MAX_FAULT = 500  # letters
-_DTYPES = ("uint8", "float32")
+_DTYPES = ("uint8", "int64", "float32", "float64")
 
 
 class Message(NamedTuple):
@@ -33,7 +33,7 @@ class Message(NamedTuple):
 
     Attributes:
       facts: whatever JSON can say.
-      arrays: of type uint8 or float32, by name.
+      arrays: of the types in `_DTYPES`, by name.
     """
 
     facts: dict[str, Any]
@@ -84,12 +84,7 @@ def open_no_more_files() -> None:
 
 
 def open_child(
-    module: str,
-    path: pathlib.Path,
-    *,
-    max_bytes: int,
-    file_bytes: int,
-    **arguments: Any,
+    module: str, path: pathlib.Path, *, max_bytes: int, **arguments: Any
 ) -> Child:
     """Starts a reader on a file.
 
@@ -97,12 +92,15 @@ def open_child(
       module: its full name.
       path: the file.
       max_bytes: of any one array.
-      file_bytes: size of all that it is to read; more of it may take more time.
       **arguments: handed to it; what JSON can say.
+
+    Raises:
+      OSError: there is no such file.
     """
+    num_bytes = path.stat().st_size
     arguments |= {"path": str(path.absolute()), "max_bytes": max_bytes}
     # Imported from where we are, and from nowhere else.
-    folders = os.pathsep.join(filter(None, sys.path))
+    folders = os.pathsep.join(folder or os.getcwd() for folder in sys.path)
     environment = {
         "PYTHONPATH": folders,
         "OPENBLAS_NUM_THREADS": "1",
@@ -112,7 +110,7 @@ def open_child(
     }
     return Child(
         [sys.executable, "-P", "-m", module, json.dumps(arguments)],
-        cpu_seconds=_CPU_SECONDS + file_bytes / _BYTES_PER_SECOND,
+        cpu_seconds=_CPU_SECONDS + num_bytes / _BYTES_PER_SECOND,
         memory_bytes=_MEMORY_BYTES + 2 * max_bytes,
         env={**os.environ, **environment},
     )

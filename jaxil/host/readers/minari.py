@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
-from jaxil.host.readers import messages, minari_file
+from jaxil.host.readers import json_file, messages, minari_file
 from jaxil.host.readers.child import Child
 from jaxil.host.readers.recording import FormatError, PixelEpisode, Recording
 
@@ -50,7 +50,11 @@ def open_recording(path: pathlib.Path, *, max_bytes: int) -> Recording:
       OSError: it cannot be opened.
     """
     folder = _data_folder(path)
-    metadata = _read_metadata(folder / _METADATA)
+    metadata = {}  # older datasets have none
+    if (folder / _METADATA).exists():
+        metadata = json_file.read_object(
+            folder / _METADATA, max_bytes=_MAX_METADATA_BYTES
+        )
     stored_as = metadata.get("data_format", "hdf5")
     if stored_as != "hdf5":
         raise FormatError(f"has data_format={stored_as!r:.50}; only 'hdf5' can be read")
@@ -88,29 +92,7 @@ def _data_folder(path: pathlib.Path) -> pathlib.Path:
 
 
 def _start(file: pathlib.Path, max_bytes: int) -> Child:
-    return messages.open_child(
-        minari_file.__name__, file, max_bytes=max_bytes, file_bytes=file.stat().st_size
-    )
-
-
-def _read_metadata(path: pathlib.Path) -> dict[str, Any]:
-    """Returns what the dataset says of itself; nothing where it is older than that."""
-    if not path.is_file():
-        return {}
-    with path.open("rb") as file:
-        content = file.read(_MAX_METADATA_BYTES + 1)
-    if len(content) > _MAX_METADATA_BYTES:
-        raise FormatError(
-            f"has a {_METADATA} of more than the {_MAX_METADATA_BYTES} bytes that are "
-            "accepted"
-        )
-    try:
-        metadata = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"has a {_METADATA} that is not JSON ({error})") from error
-    if not isinstance(metadata, dict):
-        raise FormatError(f"has a {_METADATA} without keys")
-    return metadata
+    return messages.open_child(minari_file.__name__, file, max_bytes=max_bytes)
 
 
 def _task_of(metadata: dict[str, Any]) -> str | None:
