@@ -10,7 +10,7 @@ import pytest
 
 from jaxil.host.readers import messages, minari, minari_file
 from jaxil.host.readers.recording import FormatError
-from tests.host.foreign_files import write_minari_episodes
+from tests.host.foreign_files import make_minari_dataset
 
 pytest.importorskip("minari", reason="Minari writes the datasets of these tests")
 gymnasium = pytest.importorskip("gymnasium")
@@ -40,7 +40,7 @@ def read(path, **changes):
 
 @pytest.fixture(name="path")
 def _path(tmp_path):
-    write_minari_episodes(tmp_path / "dataset", EPISODES)
+    make_minari_dataset(tmp_path / "dataset", EPISODES)
     return tmp_path / "dataset"
 
 
@@ -132,7 +132,7 @@ def test_what_an_environment_did_is_read(tmp_path, monkeypatch):
 
 def test_episodes_are_in_the_order_of_their_numbers(tmp_path, read_here):
     many = [make_episode(1, seed) for seed in range(11)]
-    write_minari_episodes(tmp_path / "many", many)
+    make_minari_dataset(tmp_path / "many", many)
     for episode, expected in zip(read_here(tmp_path / "many"), many, strict=True):
         np.testing.assert_array_equal(episode["frames"], expected["observations"])
 
@@ -148,7 +148,7 @@ def test_jpegs_are_read_with_a_note(tmp_path, kind):
     if kind == "equal":
         images = np.broadcast_to(images[:1], (4, 32, 32, 3))
     episode["observations"] = images.astype(np.uint8)
-    write_minari_episodes(tmp_path / "jpeg", [episode])
+    make_minari_dataset(tmp_path / "jpeg", [episode])
     with h5py.File(tmp_path / "jpeg" / "data" / "main_data.hdf5") as file:
         assert file["episode_0/observations"].ndim == (2 if kind == "equal" else 1)
     recording, (seen,) = read(tmp_path / "jpeg")
@@ -157,7 +157,7 @@ def test_jpegs_are_read_with_a_note(tmp_path, kind):
     difference = seen.frames.astype(int) - images
     assert np.abs(difference.mean(axis=(1, 2))).max() < 4
     # Without JPEG, nothing is lost.
-    write_minari_episodes(tmp_path / "raw", [episode], jpeg_encoding=False)
+    make_minari_dataset(tmp_path / "raw", [episode], jpeg_encoding=False)
     recording, (seen,) = read(tmp_path / "raw")
     assert recording.notes == ()
     np.testing.assert_array_equal(seen.frames, images)
@@ -174,13 +174,13 @@ def with_dictionary(*images, num_steps=3):
 
 def test_the_one_image_of_a_dictionary_is_taken(tmp_path, read_here):
     episode, space = with_dictionary("camera")
-    write_minari_episodes(tmp_path / "a", [episode], observation_space=space)
+    make_minari_dataset(tmp_path / "a", [episode], observation_space=space)
     expected = episode["observations"]["camera"]
     np.testing.assert_array_equal(read_here(tmp_path / "a")[0]["frames"], expected)
     # One level further down.
     nested = {**episode, "observations": {"eyes": episode["observations"]}}
     space = gymnasium.spaces.Dict({"eyes": space})
-    write_minari_episodes(tmp_path / "b", [nested], observation_space=space)
+    make_minari_dataset(tmp_path / "b", [nested], observation_space=space)
     np.testing.assert_array_equal(read_here(tmp_path / "b")[0]["frames"], expected)
 
 
@@ -195,14 +195,14 @@ def test_dictionaries_without_one_image_are_refused(
     tmp_path, images, message, read_here
 ):
     episode, space = with_dictionary(*images)
-    write_minari_episodes(tmp_path / "a", [episode], observation_space=space)
+    make_minari_dataset(tmp_path / "a", [episode], observation_space=space)
     with pytest.raises(FormatError, match=message):
         read_here(tmp_path / "a")
 
 
 def test_discrete_actions_are_left_out_with_a_note(tmp_path):
     episode = {**make_episode(3), "actions": np.array([1, 0, 2])}
-    write_minari_episodes(tmp_path / "a", [episode])
+    make_minari_dataset(tmp_path / "a", [episode])
     recording, (seen,) = read(tmp_path / "a")
     assert seen.actions is None
     assert seen.rewards is not None
@@ -375,7 +375,7 @@ def test_more_than_the_limit_is_refused_and_the_limit_itself_is_not(path, read_h
 
 def test_large_jpegs_are_refused_before_they_are_decoded(tmp_path, read_here):
     path = tmp_path / "dataset"
-    write_minari_episodes(path, [make_episode(3, size=32)])
+    make_minari_dataset(path, [make_episode(3, size=32)])
     whole = 4 * 32 * 32 * 3
     assert read_here(path, max_bytes=whole)[0]["frames"].nbytes == whole
     with pytest.raises(FormatError, match="32x32 pixels, 3072 bytes, more than the 30"):
@@ -439,7 +439,7 @@ def test_folders_that_are_something_else(tmp_path):
 
 def test_a_file_on_which_the_library_computes_for_ever_is_given_up(tmp_path):
     episode = make_episode(3, size=32)
-    write_minari_episodes(tmp_path / "a", [episode])
+    make_minari_dataset(tmp_path / "a", [episode])
     file = tmp_path / "a" / "data" / "main_data.hdf5"
     content = bytearray(file.read_bytes())
     # An object of the heap where JPEGs are kept, as long as to end where it begins.

@@ -96,14 +96,17 @@ def _numbers_of(name: str, column: Any) -> np.ndarray:
 
     if isinstance(column, pyarrow.ChunkedArray):
         column = column.combine_chunks()
-    num_rows, num_absent = len(column), column.null_count
+    num_rows = len(column)
+    absent = FormatError(f"has rows without a number in {name}")
+    if column.null_count:
+        raise absent
     is_list = types.is_list(column.type) or types.is_fixed_size_list(column.type)
     if is_list:
         if len(set(column.value_lengths().to_pylist())) > 1:
             raise FormatError(f"has rows of unequal lengths in {name}")
         column = column.flatten()
-    if num_absent or column.null_count:
-        raise FormatError(f"has rows without a number in {name}")
+    if column.null_count:
+        raise absent
     if types.is_integer(column.type) or types.is_boolean(column.type):
         dtype = np.int64
     elif types.is_floating(column.type):
