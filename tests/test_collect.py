@@ -61,6 +61,8 @@ def test_states_are_shown_as_table_sheet_and_video(few, tmp_path, capsys):
 def test_every_format_is_shown(name, tmp_path, capsys):
     if name == "minari":
         pytest.importorskip("minari")
+    if name == "lerobot":
+        pytest.importorskip("pyarrow")
     source = tmp_path / "source"
     getattr(foreign_files, f"write_{name}")(source, 0)
     call(f"--inspect={source}", f"--output={tmp_path}")

@@ -10,6 +10,9 @@ import imageio_ffmpeg
 import numpy as np
 from PIL import Image
 
+from jaxil.host.readers import own
+from jaxil.host.readers.recording import PixelEpisode, Recording
+
 CAMERA = "observation.images.front"  # in the datasets of LeRobot
 
 
@@ -284,3 +287,18 @@ def dreamer_entries(frames, actions, rewards) -> dict[str, np.ndarray]:
         "is_last": times == len(actions),
         "is_terminal": times < 0,
     }
+
+
+def write_own(path: pathlib.Path, seed: int) -> None:
+    """jaxil's own file of pixels; only odd seeds have actions and rewards."""
+    rng = np.random.default_rng(seed)
+    episodes = [
+        PixelEpisode(
+            _random_frames(rng, num_steps + 1),
+            rng.uniform(-1, 1, (num_steps, 2)).astype(np.float32) if seed % 2 else None,
+            rng.uniform(size=num_steps).astype(np.float32) if seed % 2 else None,
+        )
+        for num_steps in (3, 5)
+    ]
+    recording = Recording("made up", len(episodes), iter(episodes), action_repeat=2)
+    own.write_pixels(path, recording, origin="a test")

@@ -61,6 +61,7 @@ class Format(NamedTuple):
 
 
 FORMATS = {
+    "own": Format("own", "write_own", 2, 100),
     "pickles": Format("pickles", "write_pickle", 16, 200),
     "replays": Format("replays", "write_replays", 4, 100),
     "videos": Format("videos", "write_video", 2, 6),
