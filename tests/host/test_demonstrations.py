@@ -106,6 +106,7 @@ def test_a_multiple_of_the_action_repeat_skips_states_and_sums_rewards(path):
     loaded = load(path, action_repeat=4)
     np.testing.assert_array_equal(loaded.frames, FRAMES[:, ::2])
     np.testing.assert_array_equal(loaded.actions, RECORDED.actions[:, ::2])
+    assert loaded.task_rewards is not None
     pairs = RECORDED.rewards[:, 0::2] + RECORDED.rewards[:, 1::2]
     np.testing.assert_allclose(loaded.task_rewards, pairs)
     assert loaded.metadata["action_repeat"] == 4
@@ -113,6 +114,7 @@ def test_a_multiple_of_the_action_repeat_skips_states_and_sums_rewards(path):
     # Three of the four steps fill one of the agent's; the fourth is left over.
     loaded = load(path, action_repeat=6)
     np.testing.assert_array_equal(loaded.frames, FRAMES[:, [0, 3]])
+    assert loaded.actions is not None
     assert loaded.actions.shape == (NUM_EPISODES, 1, 2)
 
 

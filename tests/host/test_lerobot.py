@@ -307,6 +307,7 @@ INFO_FAULTS = {
     "no version": ({"codebase_version": 3}, "codebase_version 3"),
     "no rate": ({"fps": 0}, "has fps=0"),
     "endless rate": ({"fps": float("inf")}, "has fps=inf"),
+    "rate beyond numbers": ({"fps": 10**400}, "has fps=1000"),
     "rate in words": ({"fps": "10"}, "has fps='10'"),
     "another rate": ({"fps": 20}, "video file-000.mp4 of 10 frames per second, where"),
     "no episodes": ({"total_episodes": 0}, "has total_episodes=0"),
@@ -326,6 +327,12 @@ INFO_FAULTS = {
     "absolute": ({"data_path": "/etc/passwd"}, "refers to a file '/etc/passwd', which"),
     "empty": ({"video_path": ""}, "refers to a file ''"),
     "zero byte": ({"video_path": "a\0b"}, "which is not in it"),
+    "half a letter": ({"data_path": "\ud800"}, "which is not in it"),
+    "unreadable camera": ({"features": {"a\nb": feature("video")}}, "the name 'a"),
+    "unreadable cameras": (
+        {"features": {"\ud800": feature("video"), "b": feature("video")}},
+        r"has 2 cameras, not one: \?, b",
+    ),
     "camera as a path": (
         {
             "features": {"../../..": feature("video")},

@@ -191,7 +191,7 @@ def test_rewards_step_by_step(frame_stack):
         cost = transport.cosine_cost(
             features(jnp.asarray(frames)), features(jnp.asarray(demonstration))
         )
-        mass = np.full(EXPERT_STEPS + 1, 1.0 / (EXPERT_STEPS + 1), np.float32)
+        mass = jnp.full(EXPERT_STEPS + 1, 1.0 / (EXPERT_STEPS + 1))
         plan = transport.sinkhorn_plan(cost, mass, epsilon=0.01, num_iterations=50)
         candidates.append(-np.sum(np.asarray(cost) * np.asarray(plan), axis=1))
     best = max(candidates, key=np.sum)[1:]

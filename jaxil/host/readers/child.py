@@ -70,6 +70,7 @@ class Child:
         self._selector.register(self._stdout, selectors.EVENT_READ)
         self._selector.register(self._stderr, selectors.EVENT_READ)
         self._read_ahead = bytearray()
+        self._is_at_end = False
         self._said = bytearray()
 
     def __enter__(self) -> "Child":
@@ -104,6 +105,7 @@ class Child:
                 raise FormatError(f"is damaged: a line of more than {limit} bytes")
             more = os.read(self._stdout, 65536) if self._wait() else b""
             if not more:
+                self._is_at_end = True
                 line = bytes(self._read_ahead)
                 self._read_ahead.clear()
                 return line
@@ -124,16 +126,21 @@ class Child:
         while filled < len(view) and self._wait():
             count = os.readv(self._stdout, [view[filled:]])
             if not count:
+                self._is_at_end = True
                 break
             filled += count
         return filled
 
     def finish(self) -> int:
-        """Returns the exit status after the end of its output; negative for a signal.
+        """Returns the exit status, negative for a signal.
+
+        A program that has not been read to the end of its output is killed.
 
         Raises:
           FormatError: the time is up.
         """
+        if not self._is_at_end:
+            self._process.kill()
         with contextlib.suppress(KeyError):
             self._selector.unregister(self._stdout)
         while self._selector.get_map():
@@ -176,6 +183,6 @@ class Child:
         """Sets a limit of the child, where the system knows how (Linux)."""
         prlimit = getattr(resource, "prlimit", None)
         if prlimit is not None:
-            # It may have ended already.
-            with contextlib.suppress(ProcessLookupError, PermissionError):
+            # It may have ended already, or have a lower limit.
+            with contextlib.suppress(ProcessLookupError, PermissionError, ValueError):
                 prlimit(self._process.pid, kind, (amount, amount + 1))

@@ -13,7 +13,7 @@ from jaxil.host.readers.lerobot_index import Dataset, Episode
 from jaxil.host.readers.recording import FormatError, PixelEpisode, Recording
 
 _HEAD_BYTES = 4096  # of meta/info.json, where the key is that tells the format
-_MAX_RATE_ERROR = 0.01  # of a video's frames per second against the dataset's
+_MAX_RATE_ERROR = 0.001  # of a video's frames per second against the dataset's
 
 
 def recognises(path: pathlib.Path) -> bool:
@@ -130,12 +130,12 @@ def _videos(
         num_seen = 0
         with contextlib.closing(decoded):
             for episode in group:
-                if episode.start < num_seen:
+                skipped = round(episode.start_seconds * rate) - num_seen
+                if skipped < 0:
                     raise FormatError(
                         f"has an episode {episode.index} that begins in the one before"
                     )
-                skipped = episode.start - num_seen
-                num_seen = episode.start + episode.length
+                num_seen += skipped + episode.length
                 frames = itertools.islice(decoded, skipped, skipped + episode.length)
                 yield _stack(episode, frames, max_bytes)
 

@@ -100,7 +100,8 @@ def _numbers_of(name: str, column: Any) -> np.ndarray:
     absent = FormatError(f"has rows without a number in {name}")
     if column.null_count:
         raise absent
-    is_list = types.is_list(column.type) or types.is_fixed_size_list(column.type)
+    lists = (types.is_list, types.is_large_list, types.is_fixed_size_list)
+    is_list = any(is_one(column.type) for is_one in lists)
     if is_list:
         if len(set(column.value_lengths().to_pylist())) > 1:
             raise FormatError(f"has rows of unequal lengths in {name}")

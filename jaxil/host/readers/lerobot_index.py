@@ -3,7 +3,6 @@
 Source of the format: huggingface/lerobot, src/lerobot/datasets.
 """
 
-import math
 import os
 import pathlib
 import re
@@ -17,7 +16,9 @@ from jaxil.host.readers.recording import FormatError
 INFO = "meta/info.json"
 _MAX_INFO_BYTES = 16 * 1024**2
 _MAX_EPISODES = 1_000_000
-_MAX_FRAMES = 10_000_000  # in a video file, or before an episode
+_MAX_FRAMES = 10_000_000  # in an episode
+_MAX_FPS = 1e6
+_MAX_NAME = 200  # letters of a camera
 _REWARDS = ("next.reward", "reward")
 _PLACE = re.compile(r"\{(video_key|chunk_index|file_index)(?::0?(\d)d)?\}")
 
@@ -52,14 +53,14 @@ class Episode(NamedTuple):
       length: frames.
       data: the file of its actions.
       video: the file of its frames, where it is a video.
-      start: number of its first frame in there.
+      start_seconds: when it begins in there.
     """
 
     index: int
     length: int
     data: pathlib.Path
     video: pathlib.Path | None
-    start: int
+    start_seconds: float
 
 
 def read_info(root: pathlib.Path) -> tuple[Dataset, tuple[str, ...]]:
@@ -74,7 +75,7 @@ def read_info(root: pathlib.Path) -> tuple[Dataset, tuple[str, ...]]:
     fps, features, num_episodes = (
         info.get(name) for name in ("fps", "features", "total_episodes")
     )
-    if not isinstance(fps, int | float) or not 0 < fps < math.inf:
+    if not isinstance(fps, int | float) or not 0 < fps <= _MAX_FPS:
         raise FormatError(f"has fps={fps!r:.50} in {INFO}")
     if not isinstance(num_episodes, int) or not 0 < num_episodes <= _MAX_EPISODES:
         raise FormatError(f"has total_episodes={num_episodes!r:.50} in {INFO}")
@@ -86,9 +87,12 @@ def read_info(root: pathlib.Path) -> tuple[Dataset, tuple[str, ...]]:
     }
     cameras = [name for name, kind in kinds.items() if kind in ("video", "image")]
     if len(cameras) != 1:
-        listed = ", ".join(cameras[:20])
+        listed = ", ".join(name if name.isprintable() else "?" for name in cameras)
         raise FormatError(f"has {len(cameras)} cameras, not one: {listed}"[:500])
-    is_video = kinds[cameras[0]] == "video"
+    (camera,) = cameras
+    if not camera.isprintable() or len(camera) > _MAX_NAME:
+        raise FormatError(f"has a camera of the name {camera!r:.50}")
+    is_video = kinds[camera] == "video"
     paths = {}
     for name in ("data", "video") if is_video else ("data",):
         paths[name] = info.get(f"{name}_path")
@@ -102,9 +106,7 @@ def read_info(root: pathlib.Path) -> tuple[Dataset, tuple[str, ...]]:
     for name in _REWARDS:
         if name in kinds and "rewards" not in columns.values():
             columns[name] = "rewards"
-    dataset = Dataset(
-        root, float(fps), cameras[0], is_video, columns, paths, num_episodes
-    )
+    dataset = Dataset(root, float(fps), camera, is_video, columns, paths, num_episodes)
     return dataset, tuple(notes)
 
 
@@ -154,19 +156,18 @@ def _episode(
     file_index: int,
     video_chunk_index: int = 0,
     video_file_index: int = 0,
-    from_seconds: float = 0.0,
+    start_seconds: float = 0.0,
 ) -> Episode:
     """Returns a row of meta/episodes, checked."""
     if not 2 <= length <= _MAX_FRAMES:
         raise FormatError(f"has {length} frames in episode {index}; 2 are needed")
-    start = from_seconds * dataset.fps
-    if not 0 <= start <= _MAX_FRAMES:
-        raise FormatError(f"has an episode {index} from second {from_seconds} on")
+    if not 0 <= start_seconds <= _MAX_FRAMES / dataset.fps:
+        raise FormatError(f"has an episode {index} from second {start_seconds} on")
     data = _file(dataset, "data", chunk_index, file_index)
     video = None
     if dataset.is_video:
         video = _file(dataset, "video", video_chunk_index, video_file_index)
-    return Episode(index, length, data, video, round(start))
+    return Episode(index, length, data, video, start_seconds)
 
 
 def _file(
@@ -194,7 +195,8 @@ def inside(root: pathlib.Path, relative: str) -> pathlib.Path:
       FormatError: it is not in the dataset's folder.
     """
     parts = pathlib.PurePosixPath(relative).parts
-    if not parts or relative.startswith("/") or ".." in parts or "\0" in relative:
+    is_name = parts and parts[0] != "/" and ".." not in parts
+    if not is_name or not relative.isprintable():
         raise FormatError(f"refers to a file {relative!r:.200}, which is not in it")
     true_root = os.path.realpath(root)
     path = os.path.realpath(os.path.join(true_root, *parts))

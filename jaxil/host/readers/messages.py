@@ -126,7 +126,8 @@ def receive(child: Child, *, max_bytes: int) -> Message:
     try:
         content = json.loads(line)
         if "fault" in content:
-            raise FormatError(str(content["fault"])[:_MAX_FAULT])
+            fault = str(content["fault"])[:_MAX_FAULT]  # may quote the file
+            raise FormatError("".join(x if x.isprintable() else "?" for x in fault))
         arrays = {}
         for name, (dtype, shape) in content["arrays"].items():
             if dtype not in _DTYPES or min(shape, default=0) < 0:

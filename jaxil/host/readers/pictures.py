@@ -61,4 +61,4 @@ def _decode(content: bytes, max_bytes: int, index: int) -> np.ndarray:
     except FormatError:
         raise
     except Exception as error:  # Pillow's parsers raise whatever they stumble over
-        raise FormatError(f"has a damaged picture {index} ({error})") from error
+        raise FormatError(f"has a damaged picture {index}") from error
