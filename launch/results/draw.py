@@ -15,6 +15,8 @@ from jaxil.host.metrics import read_csv
 _HERE = pathlib.Path(__file__).parent
 _COLOURS = {"pdac": "#1f6f8b", "psil": "#c8553d", "drqv2": "#588157", "zero": "#777777"}
 _STYLES = {2: "-", 4: "--", 8: "-."}  # by action repeat
+_PENALTY = 10.0  # the discriminator's, in the paper
+_COLUMNS = 2
 _NAMES = {"pdac": "P-DAC", "psil": "P-SIL", "drqv2": "true reward", "zero": "no reward"}
 
 
@@ -24,10 +26,14 @@ def main() -> None:
     for path in sorted(_HERE.glob("*/eval.csv")):
         config = json.loads((path.parent / "config.json").read_text())["config"]
         runs.setdefault(config["task"], []).append((config, read_csv(path)))
-    figure = Figure(figsize=(5.2 * len(runs), 4.6), dpi=150, layout="constrained")
+    rows = -(-len(runs) // _COLUMNS)
+    size = (5.2 * _COLUMNS, 4.6 * rows)
+    figure = Figure(figsize=size, dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(1, len(runs), squeeze=False)[0]
-    for axes, (task, task_runs) in zip(panels, sorted(runs.items()), strict=True):
+    panels = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
+    for axes in panels[len(runs) :]:
+        axes.set_axis_off()
+    for axes, (task, task_runs) in zip(panels, sorted(runs.items()), strict=False):
         experts = [table["expert_task_return_mean"][-1] for _, table in task_runs]
         expert = max(experts)
         axes.axhline(expert, color="#444444", ls="--", lw=1.2, label="expert")
@@ -42,8 +48,7 @@ def main() -> None:
                 lw=1.6,
                 marker="o",
                 ms=2.5,
-                label=f"{_NAMES[config['method']]}, repeat {config['action_repeat']}, "
-                f"seed {config['seed']}",
+                label=_label(config),
             )
         axes.set_title(task, loc="left", fontsize=11)
         axes.set_xlim(left=0)
@@ -61,6 +66,18 @@ def main() -> None:
         )
     panels[0].set_ylabel("task return, mean of 10 episodes")
     figure.savefig(_HERE / "learning.png")
+
+
+def _label(config: dict) -> str:
+    parts = [
+        _NAMES[config["method"]],
+        f"repeat {config['action_repeat']}",
+        f"seed {config['seed']}",
+    ]
+    penalty = config["discriminator"]["gradient_penalty"]
+    if penalty != _PENALTY:
+        parts.append(f"penalty {penalty:g}")
+    return ", ".join(parts)
 
 
 if __name__ == "__main__":
