@@ -18,8 +18,8 @@ from jaxil.host.readers import (
 from jaxil.host.readers.recording import FormatError, PixelEpisode, Recording
 from jaxil.host.readers.validation import check_episode
 
-# Asked in this order; each decides by content.
-_READERS: tuple[Any, ...] = (own, pickles, videos, minari, lerobot, replays)
+# Asked in this order; each decides by content. Videos last: other datasets hold some.
+_READERS: tuple[Any, ...] = (own, pickles, minari, lerobot, replays, videos)
 FORMATS = (
     "jaxil states or pixels (.npz), ROT or PatchAIL pickles, folders of DrQ-v2 or "
     "V-D4RL episodes (.npz), videos (mp4, gif, webm), Minari and LeRobot v3 datasets"

@@ -366,6 +366,14 @@ def test_each_format_gives_the_same_demonstrations_after_conversion(
             np.testing.assert_array_equal(one, other)
 
 
+def test_a_dataset_with_a_preview_is_no_folder_of_videos(tmp_path):
+    folder = tmp_path / "replay"
+    foreign_files.write_replays(folder, 0)
+    foreign_files.write_video(folder / "preview.mp4", 0)
+    recording = foreign.open_recording(folder, max_bytes=LIMIT)
+    assert "replay" in recording.kind
+
+
 def test_the_fuzzer_knows_every_format():
     assert len(WRITERS) == len(foreign._READERS)
     assert len(test_readers_fuzz.FORMATS) == len(WRITERS)
