@@ -1,7 +1,6 @@
 """Demonstrations as the agent would see them, whatever file they come from."""
 
 import functools
-import logging
 import os
 import pathlib
 from collections.abc import Callable
@@ -10,19 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxil.host import environment as environments
-from jaxil.host import foreign, rendering, states
+from jaxil.host import foreign, mismatch, rendering, states
 from jaxil.host.readers.recording import FormatError
 from jaxil.host.stacking import gather_stacks
 from jaxil.host.states import StateDemonstrations, fault
 
-# A video's frame rate may be off by this share before anyone is told.
-_RATE_TOLERANCE = 0.1
 _WAY_OUT = (
     "Repair or replace it; `python -m jaxil.collect --inspect=FILE` shows what a file "
     "holds"
 )
-
-_logger = logging.getLogger(__name__)
 
 
 class Demonstrations(NamedTuple):
@@ -153,7 +148,13 @@ def load(
             frame_skip=frame_skip,
             max_bytes=max_bytes,
         )
-        _warn_of_pixels(path, loaded, task=task, action_repeat=action_repeat)
+        mismatch.warn_of_pixels(
+            path,
+            loaded.metadata,
+            image_size=image_size,
+            task=task,
+            action_repeat=action_repeat,
+        )
         return loaded
     stored, stride = _open_states(
         path,
@@ -163,7 +164,7 @@ def load(
         frame_skip=frame_skip,
     )
     num_steps = stored.rewards.shape[1] // stride
-    _warn_of_versions(path, stored.metadata["versions"])
+    mismatch.warn_of_versions(path, stored.metadata["versions"])
     steps = slice(0, num_steps * stride + 1, stride)
     try:
         frames = rendering.observe_episodes(
@@ -371,66 +372,3 @@ def _model_sizes(task: str) -> dict[str, int]:
     ) as environment:
         sizes = {name: len(x) for name, x in environment.simulator_state().items()}
         return {**sizes, "actions": environment.action_spec().shape[0]}
-
-
-def _warn_of_pixels(
-    path: pathlib.Path, loaded: Demonstrations, *, task: str, action_repeat: int
-) -> None:
-    """Says what of a foreign file can't match the agent's own view."""
-    metadata, size = loaded.metadata, loaded.frames.shape[2]
-    height, width = metadata["stored_size"]
-    _logger.warning(
-        "%s (%s) holds pixels of a renderer that is not this one: what the agent sees "
-        "may differ in light, colour and camera.",
-        path,
-        metadata["kind"],
-    )
-    if (height, width) != (size, size):
-        squeezed = "" if height == width else ", squeezed into a square"
-        _logger.warning(
-            "%s: frames of %dx%d pixels are resized to %dx%d%s.",
-            path,
-            width,
-            height,
-            size,
-            size,
-            squeezed,
-        )
-    repeat = metadata["action_repeat"]
-    if repeat is not None and repeat != action_repeat:
-        _logger.warning(
-            "%s was recorded with action_repeat=%d, and the run has %d: set "
-            "action_repeat or demonstrations.frame_skip so that they agree.",
-            path,
-            repeat,
-            action_repeat,
-        )
-    speed = metadata["frames_per_second"]
-    wanted = 1.0 / environments.decision_seconds(task, action_repeat)
-    if speed is not None and abs(speed / wanted - 1.0) > _RATE_TOLERANCE:
-        _logger.warning(
-            "%s has %.3g frames per second, and the agent decides %.3g times: set "
-            "demonstrations.frame_skip, now such that about %.3g frames make one.",
-            path,
-            speed,
-            wanted,
-            speed / wanted,
-        )
-    for note in metadata["notes"]:
-        _logger.warning("%s: %s", path, note)
-
-
-def _warn_of_versions(path: pathlib.Path, recorded: dict[str, str]) -> None:
-    installed = environments.simulator_versions()
-    differing = [
-        f"{name} {recorded.get(name)} (here {version})"
-        for name, version in installed.items()
-        if recorded.get(name) != version
-    ]
-    if differing:
-        _logger.warning(
-            "%s was recorded with %s: its images are drawn here, but the task may move "
-            "or look slightly different now.",
-            path,
-            ", ".join(differing),
-        )
