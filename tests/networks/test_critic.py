@@ -97,7 +97,7 @@ def test_features_of_agent_networks_are_the_critics_and_not_the_actors():
     np.testing.assert_allclose(features, trunk, atol=1e-6)
 
 
-def test_state_vectors_go_straight_to_the_trunk():
+def test_state_vectors_reach_the_trunk_through_the_encoders_hidden_layer():
     networks = make_agent_networks(
         action_dim=2,
         feature_dim=5,
@@ -111,7 +111,9 @@ def test_state_vectors_go_straight_to_the_trunk():
     )
     vectors = jax.random.normal(jax.random.key(0), (3, 7))
     encoder = networks.encoder.init(jax.random.key(0), vectors)
-    critic = networks.critic.init(jax.random.key(1), vectors, jnp.zeros((3, 2)))
-    trunk = apply(Trunk(5), {"params": critic["params"]["trunk"]}, vectors)
+    hidden = apply(networks.encoder, encoder, vectors)
+    assert hidden.shape == (3, 6)
+    critic = networks.critic.init(jax.random.key(1), hidden, jnp.zeros((3, 2)))
+    trunk = apply(Trunk(5), {"params": critic["params"]["trunk"]}, hidden)
     features = critic_features(networks, encoder, critic, vectors)
     np.testing.assert_allclose(features, trunk, atol=1e-6)
