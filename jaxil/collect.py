@@ -17,6 +17,7 @@ folders of DrQ-v2 or V-D4RL episodes, videos, Minari and LeRobot v3 datasets.
 
 import pathlib
 import sys
+import tempfile
 
 from absl import flags
 
@@ -48,6 +49,8 @@ def main(argv: list[str]) -> None:
             )
     elif "inspect" in jobs and values.output is not None:
         faults.append(f"--output={values.output} must be a folder that exists")
+    elif values.output is not None and "inspect" not in jobs:
+        faults += _output_faults(values)
     if faults:
         raise command.UsageError(command.listing(faults))
     from jaxil import platform
@@ -122,8 +125,9 @@ def _inspect(values: flags.FlagValues) -> None:
             f"--inspect={path} cannot be read ({error.strerror or error})"
         ) from error
     name = path.resolve().stem
+    # Never the name of what is shown, which may be a video in this very folder.
     folder = pathlib.Path(values.output or ".")
-    sheet, video = folder / f"{name}_sheet.png", folder / f"{name}.mp4"
+    sheet, video = folder / f"{name}_sheet.png", folder / f"{name}_episode0.mp4"
     try:
         temporary = sheet.with_suffix(".part")
         inspection.contact_sheet(seen).save(temporary, format="png")
@@ -171,6 +175,22 @@ def _convert(values: flags.FlagValues) -> None:
         f"{output}: {recording.num_episodes} episodes of {recording.kind}, "
         f"{size:.2f} MB"
     )
+
+
+def _output_faults(values: flags.FlagValues) -> list[str]:
+    """Says why the output can't be written, before minutes of work end at it."""
+    output = pathlib.Path(values.output)
+    if values.convert and output.resolve() == pathlib.Path(values.convert).resolve():
+        return [f"--output={output} is the file to convert: name another one"]
+    folder = next(parent for parent in output.absolute().parents if parent.exists())
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            return []
+    except OSError as error:
+        return [
+            f"--output={output} can't be written ({error.strerror or error}): name "
+            "a file in a folder of yours"
+        ]
 
 
 def _named_output(argv: list[str]) -> list[str]:

@@ -50,7 +50,10 @@ def test_states_are_shown_as_table_sheet_and_video(few, tmp_path, capsys):
     printed = capsys.readouterr().out
     for words in ("format: jaxil states", "task: cartpole_swingup", "episodes: 2"):
         assert words in printed
-    assert {path.name for path in folder.iterdir()} == {"few_sheet.png", "few.mp4"}
+    assert {path.name for path in folder.iterdir()} == {
+        "few_sheet.png",
+        "few_episode0.mp4",
+    }
     sheet = imageio.v3.imread(folder / "few_sheet.png")
     # Two rows of eight pictures, 96 pixels wide at least, with something on them.
     assert sheet.shape[1] > 8 * 96
@@ -71,7 +74,17 @@ def test_every_format_is_shown(name, tmp_path, capsys):
     assert f"format: {recording.kind}" in printed
     assert f"episodes: {recording.num_episodes}" in printed
     assert (tmp_path / "source_sheet.png").stat().st_size > 0
-    assert (tmp_path / "source.mp4").stat().st_size > 0
+    assert (tmp_path / "source_episode0.mp4").stat().st_size > 0
+
+
+def test_showing_a_video_leaves_it_as_it_is(tmp_path, monkeypatch):
+    video = tmp_path / "clip.mp4"
+    foreign_files.write_video(video, 0)
+    before = video.read_bytes()
+    monkeypatch.chdir(tmp_path)
+    call("--inspect=clip.mp4")
+    assert video.read_bytes() == before
+    assert (tmp_path / "clip_episode0.mp4").exists()
 
 
 def test_the_sheet_shows_an_episode_from_first_to_last_frame():
@@ -136,6 +149,8 @@ def test_pixels_keep_their_size_unless_another_is_asked_for(tmp_path):
         (["--inspect=a", "--convert=b", "--output=c"], "given: --inspect, --convert"),
         (["--convert=a"], "--output is missing"),
         (["--convert=a", "--output=."], "is a folder"),
+        (["--convert=a.npz", "--output=./a.npz"], "is the file to convert"),
+        (["--workdirs=a", "--output=/proc/x.npz"], "can't be written"),
         (["--inspect=none.npz"], "none.npz cannot be read"),
         (["--inspect=setup.cfg"], "in no format that is read"),
         (["--inspect=setup.cfg", "--output=setup.cfg"], "must be a folder"),

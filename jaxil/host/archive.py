@@ -97,7 +97,7 @@ def _read_member(
             "that are accepted"
         )
     if info.compress_type not in _MAX_RATIOS:
-        raise NotImplementedError("an unknown compression")
+        raise ValueError("is packed by a compression that is not read")
     if (
         info.compress_size > file_bytes
         or info.file_size > info.compress_size * _MAX_RATIOS[info.compress_type]
