@@ -253,7 +253,7 @@ def _define(values: flags.FlagValues) -> None:
     flags.DEFINE_enum(
         "render_quality",
         "paper",
-        ["paper", "fast"],
+        ["paper", "fast", "smooth"],
         "how states are drawn by --convert and --inspect",
         flag_values=values,
     )

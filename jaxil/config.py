@@ -19,7 +19,7 @@ METHODS = {
     "zero": "no reward at all: the control",
 }
 OBSERVATIONS = ("pixels", "state")
-RENDER_QUALITIES = ("paper", "fast")
+RENDER_QUALITIES = ("paper", "fast", "smooth")
 
 # The paper's budgets, in environment frames; other tasks get the larger one.
 _EASY_TASKS = ("cartpole_swingup", "finger_spin", "ball_in_cup_catch")
@@ -44,7 +44,7 @@ def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Conf
     config.action_repeat = 2
     config.image_size = 84
     config.frame_stack = 3
-    config.render_quality = "paper"  # dm_control's own; "fast" for software GL
+    config.render_quality = "paper"  # dm_control's own; see `Renderer`
     config.total_frames = _EASY_FRAMES if task in _EASY_TASKS else _HARD_FRAMES
 
     # Replay and schedule.

@@ -104,7 +104,7 @@ def render_recording(
     Args:
       path: the file.
       image_size: height and width in pixels.
-      render_quality: "paper" or "fast".
+      render_quality: "paper", "fast" or "smooth".
 
     Raises:
       DemonstrationError: the file is damaged.

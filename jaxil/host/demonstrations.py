@@ -126,7 +126,7 @@ def load(
       action_repeat: the agent's; a multiple of a state file's. Of the steps that become
         one, rewards are summed and the first one's action stands for all.
       image_size: height and width in pixels.
-      render_quality: "paper" or "fast".
+      render_quality: "paper", "fast" or "smooth".
       observation: "pixels" or "state".
       frame_skip: for files of pixels: every so many-th frame is kept.
       max_bytes: for files of pixels: the memory that they may take.

@@ -52,7 +52,7 @@ def observe_episodes(
       first_episode: number of episode 0 there. With the seed it restores what the
         states don't hold: targets, terrain.
       image_size: height and width in pixels.
-      render_quality: "paper" or "fast".
+      render_quality: "paper", "fast" or "smooth".
       observation: "pixels" or "state".
       cache: whether images are looked up in, and added to, `cache_folder()`.
       progress: called with (images drawn, images in all), if any have to be.

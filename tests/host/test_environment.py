@@ -211,6 +211,14 @@ def test_qualities_look_different():
 # --- reproducibility ------------------------------------------------------------------
 
 
+def test_smooth_is_the_mean_of_four_pixels_of_fast():
+    fast = small(image_size=2 * SIZE).reset().observation.astype(int)
+    means = fast.reshape(SIZE, 2, SIZE, 2, -1).mean((1, 3))
+    smooth = small(render_quality="smooth").reset().observation
+    assert smooth.shape == (SIZE, SIZE, 9)
+    np.testing.assert_allclose(smooth, means, atol=0.5)
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_stored_states_give_the_same_pixels(task):
     environment, other = small(task), small(task)
