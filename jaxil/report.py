@@ -1,0 +1,117 @@
+r"""Turns folders of runs into one page with figures, tables and videos.
+
+    python -m jaxil.report RUNS... --output=report
+
+RUNS are folders; every folder with a config.json in or below them is a run, finished or
+not. Writes report/index.html, which opens without a network, report/figures (PNG and
+SVG) and report/tables (CSV). Seeds are averaged with 90 % confidence intervals; runs
+that differ in other settings are kept apart. An older report there is replaced.
+"""
+
+import pathlib
+import sys
+
+from absl import flags
+
+from jaxil import command
+
+_MAX_SEEDS = 10_000
+
+
+def main(argv: list[str]) -> None:
+    """Runs the command."""
+    values = command.parse(_named_runs(argv), __doc__ or "", _define)
+    from jaxil.reporting import folder
+
+    output = pathlib.Path(values.output)
+    roots = [pathlib.Path(name) for name in dict.fromkeys(values.runs)]
+    faults = [
+        f"there is no folder {str(root)!r}" for root in roots if not root.is_dir()
+    ]
+    if not roots:
+        faults.append("name the folders of runs: python -m jaxil.report RUNS...")
+    if not values.output:
+        faults.append("--output is empty: name a folder to be made")
+    else:
+        faults += folder.problems(output)
+    if faults:
+        raise command.UsageError(command.listing(faults))
+
+    from jaxil.reporting import assembly, runs
+
+    found, unreadable = [], []
+    for place in runs.find(roots):
+        try:
+            found.append(runs.read(place))
+        except runs.UnreadableError as error:
+            unreadable.append(f"{place / 'config.json'} {error}; skipped")
+    if not found:
+        names = ", ".join(map(str, roots))
+        rule = f"no run can be read in or below {names}: a run is a folder that "
+        rule += "`python -m jaxil.launch` has written, with a config.json"
+        raise command.UsageError(command.listing([*unreadable, rule]))
+    for sentence in unreadable:
+        print(sentence, file=sys.stderr)
+    print(f"{len(found)} runs; drawing", file=sys.stderr, flush=True)
+    try:
+        assembly.write_report(
+            found,
+            output,
+            unreadable=unreadable,
+            num_seeds=values.seeds,
+            num_videos=values.videos,
+        )
+    except OSError as error:
+        raise command.UsageError(
+            f"--output={str(output)!r} can't be written ({error.strerror or error}); "
+            "name a folder of yours on a disk with room"
+        ) from error
+    size = (output / "index.html").stat().st_size / 1e6
+    print(f"{output / 'index.html'}: {len(found)} runs, {size:.1f} MB")
+
+
+def _named_runs(argv: list[str]) -> list[str]:
+    """Turns the words that are no flags into --runs=WORD, for the parser."""
+    named, takes_value = argv[:1], False
+    for word in argv[1:]:
+        if word.startswith("-"):
+            takes_value = word.lstrip("-") in ("output", "seeds", "videos", "runs")
+            named.append(word)
+        else:
+            named.append(word if takes_value else f"--runs={word}")
+            takes_value = False
+    return named
+
+
+def _define(values: flags.FlagValues) -> None:
+    flags.DEFINE_multi_string(
+        "runs",
+        [],
+        "folder to look for runs in; the same as a word without a flag",
+        flag_values=values,
+    )
+    flags.DEFINE_string(
+        "output",
+        "report",
+        "folder to make; an older report there is replaced",
+        flag_values=values,
+    )
+    flags.DEFINE_integer(
+        "seeds",
+        10,
+        "how many seeds each variant should have; fewer are said to be missing",
+        lower_bound=1,
+        upper_bound=_MAX_SEEDS,
+        flag_values=values,
+    )
+    flags.DEFINE_integer(
+        "videos",
+        1,
+        "how many of the newest videos to show for each variant on each task",
+        lower_bound=0,
+        flag_values=values,
+    )
+
+
+if __name__ == "__main__":
+    command.run(main)

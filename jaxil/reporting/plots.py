@@ -1,0 +1,248 @@
+"""Draws one panel: curves, bars, logits, an episode's rewards, a transport plan."""
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxil.reporting.appearance import INK, Look
+from jaxil.reporting.measures import Curve, Final
+
+_DOTTED = 40  # points; a line with fewer shows each of them
+_LABEL_WIDTH = 58  # characters above a bar
+_BAR_LINES = 1.8  # of text, that a bar takes
+_LINE_HEIGHT = 0.145  # inches
+# Beyond this many times the height of the means, an interval is cut off.
+_BAND_ROOM = 1.25
+
+
+def curves(
+    axes: Any,
+    lines: Sequence[Curve],
+    looks: Mapping[str, Look],
+    *,
+    levels: Sequence[tuple[float, str]] = (),
+    over: str,
+    name: str,
+) -> None:
+    """Draws the mean of each group with its interval.
+
+    Args:
+      axes: Matplotlib's.
+      lines: at least one.
+      looks: by label.
+      levels: heights to mark with a dashed line, and their names.
+      over: "frame" or "hours".
+      name: what is drawn, for the vertical axis.
+    """
+    for line in lines:
+        _line(axes, line, looks[line.group.label])
+    for value, text in levels:
+        axes.axhline(value, color=INK, ls=(0, (4, 3)), lw=0.9, alpha=0.75, zorder=1)
+        axes.annotate(
+            text,
+            (0.995, value),
+            xycoords=("axes fraction", "data"),
+            xytext=(0, 2),
+            textcoords="offset points",
+            ha="right",
+            va="bottom",
+            fontsize=7.5,
+            alpha=0.85,
+        )
+    heights = [line.mean.value for line in lines] + [[value for value, _ in levels]]
+    bands = [end for line in lines for end in line.mean[1:]]
+    axes.set_ylim(*_vertical(np.concatenate(heights), np.concatenate(bands)))
+    _horizontal(axes, max(float(line.x[-1]) for line in lines), over)
+    axes.set_ylabel(name)
+    axes.grid(axis="y", alpha=0.16, lw=0.6, color=INK)
+
+
+def bars(
+    axes: Any, finals: Sequence[Final], looks: Mapping[str, Look], *, extent: float
+) -> None:
+    """Draws the mean of the last evaluations, a dot for each seed.
+
+    Hatched where a run is unfinished.
+
+    Args:
+      axes: Matplotlib's.
+      finals: at least one.
+      looks: by label.
+      extent: height of the axis in text lines, at least `bars_extent`, so that bars
+        of several panels are equally thick.
+    """
+    place, highest = 0.0, 1.0
+    for final in finals:
+        look = looks[final.group.label]
+        lines = _label_lines(final)
+        place += len(lines)
+        axes.text(0, place, "\n".join(lines), fontsize=8, va="bottom", linespacing=1.15)
+        place += _BAR_LINES / 2
+        unfinished = final.group.num_finished < len(final.group.runs)
+        mean, low, high = map(float, final.mean)
+        axes.barh(
+            place,
+            mean,
+            height=1.1,
+            color=look.colour,
+            alpha=0.88,
+            lw=0,
+            hatch="////" if unfinished else None,
+            edgecolor="#ffffff88",
+        )
+        if np.isfinite(high):
+            axes.plot([low, high], [place, place], color=INK, lw=1.3, zorder=4)
+        axes.plot(
+            final.returns,
+            np.full(len(final.returns), place),
+            ls="",
+            marker="o",
+            ms=3.6,
+            mfc=look.colour,
+            mec=INK,
+            mew=0.8,
+            zorder=5,
+        )
+        top = np.nanmax([mean, high, final.returns.max()])
+        highest = max(highest, float(top))
+        axes.annotate(
+            f"{mean:.0f}",
+            (max(float(top), 0.0), place),
+            xytext=(6, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=8.5,
+        )
+        place += _BAR_LINES / 2
+    experts = sorted({round(f.expert, 1) for f in finals if np.isfinite(f.expert)})
+    for expert in experts:
+        axes.axvline(expert, color=INK, ls=(0, (4, 3)), lw=0.9, alpha=0.75, zorder=1)
+    right = 1.12 * max([highest, *experts])
+    lowest = min(0.0, *(float(f.returns.min()) for f in finals))
+    axes.set_xlim(lowest, right)
+    axes.set_ylim(extent, 0)
+    axes.set_yticks([])
+    axes.spines["left"].set_visible(False)
+    axes.set_xlabel("task return" + (", expert dashed" if experts else ""))
+
+
+def bars_extent(finals: Sequence[Final]) -> float:
+    """Returns the height that `bars` needs, in text lines."""
+    return sum(len(_label_lines(final)) + _BAR_LINES for final in finals)
+
+
+def bars_height(extent: float) -> float:
+    """Returns the height of a panel of bars, in inches."""
+    return 0.6 + _LINE_HEIGHT * extent
+
+
+def logits(
+    axes: Any, pairs: Sequence[tuple[Curve, Curve]], looks: Mapping[str, Look]
+) -> None:
+    """Draws the discriminator's logits of expert (solid) and agent (dotted)."""
+    for expert, agent in pairs:
+        colour = looks[expert.group.label].colour
+        axes.plot(expert.x, expert.mean.value, color=colour, lw=1.4)
+        axes.plot(agent.x, agent.mean.value, color=colour, lw=1.4, ls=(0, (1, 1.2)))
+    axes.axhline(0.0, color=INK, lw=0.7, alpha=0.5)
+    _horizontal(axes, max(float(pair[0].x[-1]) for pair in pairs), "frame")
+    axes.set_ylabel("mean logit")
+    axes.grid(axis="y", alpha=0.16, lw=0.6, color=INK)
+
+
+def rewards(axes: Any, imitation: np.ndarray, task: np.ndarray, colour: str) -> None:
+    """Draws the rewards of one episode.
+
+    Args:
+      axes: Matplotlib's.
+      imitation: what the agent learns from. Shape [T].
+      task: the true reward, which it never sees. Shape [T] or empty.
+      colour: of the imitation reward.
+    """
+    axes.plot(np.arange(len(imitation)), imitation, color=colour, lw=1.1)
+    axes.set_ylabel("imitation reward", color=colour)
+    axes.set_xlim(0, max(len(imitation), 2))
+    axes.set_xlabel("agent step")
+    if len(task):
+        other = axes.twinx()
+        other.plot(np.arange(len(task)), task, color=INK, lw=0.9, alpha=0.6)
+        other.set_ylabel("task reward")
+        other.set_ylim(min(0.0, float(np.nanmin(task))), _above(task))
+        other.spines[["top", "left"]].set_visible(False)
+
+
+def plan(axes: Any, weights: np.ndarray) -> None:
+    """Draws a transport plan: which expert frame each agent frame is matched with.
+
+    Args:
+      axes: Matplotlib's.
+      weights: at least 0. Shape [T + 1, N + 1].
+    """
+    from matplotlib.colors import PowerNorm
+
+    shown = np.nan_to_num(weights)
+    norm = PowerNorm(0.5, vmin=0.0, vmax=max(float(shown.max()), 1e-12))
+    axes.imshow(
+        shown.T,
+        origin="lower",
+        aspect="auto",
+        cmap="magma",
+        norm=norm,
+        interpolation="nearest",
+        extent=(0, shown.shape[0], 0, shown.shape[1]),
+    )
+    axes.set_xlabel("agent step")
+    axes.set_ylabel("expert step")
+
+
+def _label_lines(final: Final) -> list[str]:
+    # Only after commas: a setting stays beside its value.
+    text = final.group.label.replace(" ", "\xa0").replace(",\xa0", ", ")
+    return textwrap.wrap(text, _LABEL_WIDTH)
+
+
+def _line(axes: Any, line: Curve, look: Look) -> None:
+    marker = look.marker if len(line.x) <= _DOTTED else None
+    mean, low, high = line.mean
+    whole = line.count == line.num_runs
+    axes.fill_between(line.x, low, high, color=look.colour, alpha=0.17, lw=0)
+    style = {"color": look.colour, "ls": look.line, "marker": marker, "ms": 2.8}
+    axes.plot(line.x, np.where(whole, mean, np.nan), lw=1.7, zorder=3, **style)
+    # Faint where seeds have ended, since the mean jumps as they leave; up to the next
+    # points of the other line, so that both meet.
+    beside = np.convolve(~whole, [1, 1, 1])[1:-1] > 0
+    if beside.any():
+        faint = np.where(beside, mean, np.nan)
+        axes.plot(line.x, faint, lw=1.3, alpha=0.45, zorder=2, **style)
+
+
+def _vertical(heights: np.ndarray, bands: np.ndarray) -> tuple[float, float]:
+    """Returns the ends of an axis with zero, all heights and most of the bands."""
+    heights, bands = heights[np.isfinite(heights)], bands[np.isfinite(bands)]
+    low, high = min(0.0, float(heights.min())), max(0.0, float(heights.max()))
+    size = max(high - low, 1e-3)
+    # The interval of two seeds can be many times as high as their curve.
+    room = (_BAND_ROOM - 1.0) * size
+    top = max(high, min(float(bands.max(initial=high)), high + room))
+    bottom = low
+    if low < 0:
+        bottom = min(low, max(float(bands.min(initial=low)), low - room)) - 0.04 * size
+    return bottom, top + 0.08 * size
+
+
+def _horizontal(axes: Any, right: float, over: str) -> None:
+    from matplotlib.ticker import EngFormatter, MaxNLocator
+
+    axes.set_xlim(0, 1.02 * right if right > 0 else 1.0)
+    axes.xaxis.set_major_locator(MaxNLocator(6))
+    if over == "frame":
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.set_xlabel("environment frames")
+    else:
+        axes.set_xlabel("hours")
+
+
+def _above(values: np.ndarray) -> float:
+    return max(1.05 * float(np.nanmax(values)), 1e-3)
