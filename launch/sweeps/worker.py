@@ -22,7 +22,7 @@ from launch.sweeps.process import Process
 _POLL_SECONDS = 0.2
 _IDLE_SECONDS = 2.0
 # What jaxil.launch says to the first request to stop; a second one ends it unsaved.
-_HAS_HEARD = "once more ends at once"
+HAS_HEARD = "once more ends at once"
 _HEARING_SECONDS = 3.0
 # After SIGTERM, Slurm either kills the job or lets submitit requeue it.
 _VERDICT_SECONDS = 600.0
@@ -182,7 +182,7 @@ class Worker:
             # Slurm may have told the process too, or only this one: it depends on
             # the cluster. One request saves, two don't.
             time.sleep(self._pause)
-            if _HAS_HEARD not in _read(run, begin):
+            if HAS_HEARD not in _read(run, begin):
                 process.terminate()
 
     def _has_to_stop(self) -> bool:

@@ -1,0 +1,236 @@
+"""Sweeps on a Slurm cluster: a real one, of this machine alone, made for the test."""
+
+import contextlib
+import os
+import pathlib
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from jaxil.host.metrics import read_csv
+from launch.sweeps import slurm, state
+from launch.sweeps.state import State
+from tests.commands import ROOT, SMALL
+from tests.trainer import FRAMES, stand_in
+
+_DAEMONS = ("slurmctld", "slurmd")
+_SECONDS = 120.0  # for what takes ten on an idle machine
+
+_reason = next((f"{d} is not installed" for d in _DAEMONS if not shutil.which(d)), "")
+if not _reason and os.geteuid() != 0:
+    _reason = "only root can start jobs"
+pytestmark = pytest.mark.skipif(bool(_reason), reason=f"no Slurm here: {_reason}")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cluster(tmp_path_factory):
+    """Starts a controller and one node, on ports and in folders of their own."""
+    home = tmp_path_factory.mktemp("slurm")
+    for name in ("state", "spool"):
+        (home / name).mkdir()
+    host = socket.gethostname().split(".")[0]
+    (home / "slurm.conf").write_text(_CONF.format(home=home, host=host, **_ports()))
+    with pytest.MonkeyPatch.context() as patch, contextlib.ExitStack() as stack:
+        patch.setenv("SLURM_CONF", str(home / "slurm.conf"))
+        for name in _DAEMONS:
+            log = stack.enter_context((home / f"{name}.out").open("w"))
+            process = subprocess.Popen([name, "-D"], stdout=log, stderr=log)
+            stack.callback(process.wait)
+            stack.callback(process.terminate)
+        _wait_for(lambda: "idle" in _output("sinfo", "--noheader", "--format=%T"))
+        yield home
+        _output("scancel", "--user=root")
+        _wait_for(lambda: not _output("squeue", "--noheader"))
+
+
+# Nobody else can reach it, so it knows no passwords.
+_CONF = """
+ClusterName=tests
+SlurmctldHost={host}(127.0.0.1)
+SlurmUser=root
+AuthType=auth/none
+CredType=cred/none
+SlurmctldPort={control}
+SlurmdPort={node}
+SlurmctldPidFile={home}/slurmctld.pid
+SlurmdPidFile={home}/slurmd.pid
+StateSaveLocation={home}/state
+SlurmdSpoolDir={home}/spool
+SlurmctldLogFile={home}/slurmctld.log
+SlurmdLogFile={home}/slurmd.log
+ProctrackType=proctrack/linuxproc
+TaskPlugin=task/none
+SelectType=select/cons_tres
+SelectTypeParameters=CR_Core
+ReturnToService=2
+KillWait=5
+JobAcctGatherType=jobacct_gather/none
+AccountingStorageType=accounting_storage/none
+MpiDefault=none
+SchedulerParameters=sched_interval=2
+NodeName={host} NodeAddr=127.0.0.1 CPUs=2 State=UNKNOWN
+PartitionName=debug Nodes=ALL Default=YES MaxTime=INFINITE State=UP
+"""
+
+
+def _submit(runs, folder):
+    slurm.submit(
+        runs,
+        logs=folder / ".sweep",
+        folder=ROOT,
+        hours=1.0,
+        partition="",
+        num_gpus=0,
+        num_cpus=1,
+    )
+
+
+@pytest.fixture
+def importable(monkeypatch):
+    """Lets jobs import this project, as `clusters.start` does."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    # submitit would close the streams that pytest captures.
+    monkeypatch.setenv("SUBMITIT_LOG_LEVEL", "NOCONFIG")
+
+
+@pytest.mark.usefixtures("importable")
+@pytest.mark.parametrize(
+    "signals", [["USR2"], ["TERM", "USR2"]], ids=["timeout", "preemption"]
+)
+def test_a_warned_job_saves_is_queued_again_and_goes_on(tmp_path, signals):
+    run = stand_in(tmp_path, "warned", episodes=42, seconds=0.2)
+    _submit([run], tmp_path)
+    job = state.slurm_job(run)
+    assert job is not None
+    _wait_for(lambda: _rows(run) >= 7)
+    assert state.status(run).state is State.RUNNING
+    for name in signals:
+        _output("scancel", f"--signal={name}", job)
+    _wait_for(lambda: state.status(run).state is not State.RUNNING)
+    done = _rows(run)
+    assert done < 42
+    # It saved when it was asked to, not only every five episodes.
+    assert (run.folder / "checkpoints" / f"frame_{done * FRAMES:012d}").exists()
+    assert job in slurm.queued_jobs([run])
+    _hurry(job)
+    _wait_for(lambda: state.is_finished(run))
+    assert f"from episode {done}\n" in (run.folder / "log.txt").read_text()
+    _check_rows(run, processes=2)
+
+
+@pytest.mark.usefixtures("importable")
+def test_a_job_that_was_killed_goes_on_from_its_last_checkpoint(tmp_path):
+    killed, other = (
+        stand_in(tmp_path, name, episodes=30, seconds=0.2) for name in ("one", "two")
+    )
+    _submit([killed, other], tmp_path)
+    job = state.slurm_job(killed)
+    assert job is not None
+    assert "_" in job  # of an array
+    _wait_for(lambda: _rows(killed) >= 7)
+    # As when a node breaks down: nobody is warned.
+    trainer = int(read_csv(killed.folder / "train.csv")["process"][-1])
+    worker = int(pathlib.Path(f"/proc/{trainer}/stat").read_text().split()[3])
+    for process in (worker, trainer):
+        os.kill(process, signal.SIGKILL)
+    _wait_for(lambda: job not in slurm.queued_jobs([killed]))
+    _output("scontrol", "requeue", job)
+    _hurry(job)
+    for run in (killed, other):
+        _wait_for(lambda run=run: state.is_finished(run))
+    assert "from episode 5\n" in (killed.folder / "log.txt").read_text()
+    _check_rows(killed, processes=2)
+    _check_rows(other, processes=1)
+    assert state.failure(killed) is None
+
+
+@pytest.mark.usefixtures("importable")
+def test_a_cancelled_job_saves_and_stays_away(tmp_path):
+    run = stand_in(tmp_path, "cancelled", episodes=1000, seconds=0.2)
+    _submit([run], tmp_path)
+    _wait_for(lambda: _rows(run) >= 2)
+    _output("scancel", state.slurm_job(run) or "")
+    _wait_for(lambda: not slurm.queued_jobs([run]))
+    _wait_for(lambda: state.status(run).state is State.PARTLY_DONE)
+    done = _rows(run)
+    assert (run.folder / "checkpoints" / f"frame_{done * FRAMES:012d}").exists()
+
+
+# Minutes on a busy machine: two trainings that compile.
+def test_a_sweep_of_real_runs_survives_a_requeue(tmp_path):
+    arguments = [
+        *(sys.executable, "launch/sweep.py", "--cluster=slurm", "--gpus=0", "--cpus=1"),
+        *("--methods=drqv2", "--preset=tiny", "--tasks=ball_in_cup_catch"),
+        *("--seeds=1", f"--workdir={tmp_path}", *SMALL),
+        *("--config.observation=state", "--config.encoder.subtract_mean_image=False"),
+        "--config.total_frames=20000",
+    ]
+    sweep = _run(arguments)
+    assert "1 submitted" in sweep
+    home = tmp_path / "ball_in_cup_catch" / "drqv2" / "seed0"
+    # The same command again finds it queued, or running.
+    assert "0 submitted" in _run(arguments)
+    _wait_for(lambda: list(home.glob("checkpoints/frame_*")), seconds=400)
+    job = (home / "slurm_job").read_text()
+    _output("scontrol", "requeue", job)
+    _hurry(job)
+    _wait_for(lambda: "1 finished" in _run([*arguments, "--watch"]), seconds=400)
+    assert "going on from the checkpoint" in (home / "log.txt").read_text()
+    # The episode that was cut off is dropped, so frames are no round numbers.
+    table = read_csv(home / "train.csv")
+    assert list(table["episode"]) == list(range(len(table["episode"])))
+    assert np.all(np.diff(table["frame"]) >= 1000)
+    assert table["frame"][-1] >= 20000
+
+
+def _run(arguments) -> str:
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(
+        arguments, cwd=ROOT, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def _hurry(job: str) -> None:
+    """Spares a requeued job the two minutes that Slurm lets it wait."""
+    _wait_for(
+        lambda: "PENDING" in _output("squeue", "--noheader", "--format=%T", f"-j{job}")
+    )
+    _output("scontrol", "update", f"JobId={job}", "StartTime=now")
+
+
+def _ports() -> dict[str, int]:
+    with socket.socket() as first, socket.socket() as second:
+        for one in (first, second):
+            one.bind(("127.0.0.1", 0))
+        return {"control": first.getsockname()[1], "node": second.getsockname()[1]}
+
+
+def _rows(run) -> int:
+    return state.status(run).frame // FRAMES
+
+
+def _check_rows(run, processes: int) -> None:
+    """Checks that no episode is missing or was written twice."""
+    table = read_csv(run.folder / "train.csv")
+    assert list(table["frame"]) == list(range(FRAMES, run.total_frames + 1, FRAMES))
+    assert len(set(table["process"])) == processes
+
+
+def _output(*arguments: str) -> str:
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=60)
+    return done.stdout
+
+
+def _wait_for(condition, seconds: float = _SECONDS) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "too slow"
+        time.sleep(0.2)

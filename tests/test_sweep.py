@@ -1,0 +1,422 @@
+"""Sweeps: what is planned, what is done, what is done again, and what is refused."""
+
+import os
+import pathlib
+import pickle
+import signal
+import subprocess
+import sys
+import time
+import types
+
+import pytest
+
+from jaxil import train
+from jaxil.host.metrics import read_csv
+from launch.sweeps import clusters, cost, plan, state, tables
+from launch.sweeps.clusters import Cluster
+from launch.sweeps.faults import Faulty
+from launch.sweeps.process import Process
+from launch.sweeps.state import State, Status
+from launch.sweeps.worker import HAS_HEARD
+from tests.commands import ROOT, SMALL
+from tests.trainer import FRAMES, stand_in
+
+_SECONDS = 100.0  # for what takes two on an idle machine
+
+
+def _request(folder, **changes):
+    request = plan.Request(
+        methods=["pdac", "psil"],
+        ablations=[],
+        tasks=["cartpole_swingup", "walker_run"],
+        num_seeds=2,
+        preset="paper",
+        folder=folder,
+        overrides=[],
+    )
+    return plan.dataclasses.replace(request, **changes)
+
+
+def _runs(folder, **changes):
+    return plan.make_runs(_request(folder, **changes), lambda config: [])
+
+
+def _faults(folder, config_problems=lambda config: [], **changes):
+    with pytest.raises(Faulty) as raised:
+        plan.make_runs(_request(folder, **changes), config_problems)
+    return raised.value.sentences
+
+
+# The plan.
+
+
+def test_all_tasks_variants_and_seeds_are_planned_seed_by_seed(tmp_path):
+    runs = _runs(tmp_path)
+    assert [run.name for run in runs] == [
+        "cartpole_swingup/pdac/seed0",
+        "cartpole_swingup/psil/seed0",
+        "walker_run/pdac/seed0",
+        "walker_run/psil/seed0",
+        "cartpole_swingup/pdac/seed1",
+        "cartpole_swingup/psil/seed1",
+        "walker_run/pdac/seed1",
+        "walker_run/psil/seed1",
+    ]
+    last = runs[-1]
+    assert last.folder == tmp_path / "walker_run" / "psil" / "seed1"
+    assert last.total_frames == 5_000_000
+    config = plan.read_config(last.command)
+    assert (config.method, config.task, config.seed) == ("psil", "walker_run", 1)
+    assert f"--workdir={last.folder}" in last.command
+
+
+def test_an_ablation_has_its_variants_and_its_shorter_budget(tmp_path):
+    runs = _runs(tmp_path, methods=[], ablations=["figure8"], num_seeds=1)
+    budgets = {f"{run.task}/{run.slug}": run.total_frames for run in runs}
+    assert budgets == {
+        "cartpole_swingup/pdac": 1_500_000,
+        "cartpole_swingup/pdac_actions": 1_500_000,
+        "walker_run/pdac": 3_000_000,
+        "walker_run/pdac_actions": 3_000_000,
+    }
+    actions = plan.read_config(runs[-1].command)
+    assert actions.discriminator.sees_actions
+    assert actions.total_frames == 3_000_000
+
+
+def test_methods_and_ablations_make_a_union_with_the_longer_budget(tmp_path):
+    runs = _runs(tmp_path, ablations=["figure8", "figure12"], num_seeds=1)
+    budgets = {r.slug: r.total_frames for r in runs if r.task == "walker_run"}
+    assert budgets == {
+        "pdac": 5_000_000,
+        "psil": 5_000_000,
+        "pdac_actions": 3_000_000,
+    }
+    assert len(runs) == 2 * len(budgets)
+    chosen = _runs(
+        tmp_path,
+        methods=[],
+        ablations=["figure8"],
+        overrides=["--config.total_frames=4000"],
+    )
+    assert {run.total_frames for run in chosen} == {4000}
+
+
+def test_a_changed_field_names_the_variant_that_it_makes(tmp_path):
+    overrides = ["--config.shift_padding=0"]
+    runs = _runs(tmp_path, methods=["pdac"], preset="tiny", overrides=overrides)
+    assert {run.slug for run in runs} == {"pdac_no_augmentation"}
+    (fault,) = _faults(
+        tmp_path, methods=[], ablations=["figure8"],
+        overrides=["--config.discriminator.sees_actions=True"],
+    )  # fmt: skip
+    assert "is what the figure varies" in fault
+
+
+# What is refused, all of it together.
+
+
+def test_every_fault_of_every_run_is_told_once(tmp_path):
+    (tmp_path / "file").touch()
+    told = _faults(
+        tmp_path / "file" / "x",
+        lambda config: ["bad here"] if config.method == "pdac" else [],
+        methods=["gail", "pdac", "psil"],
+        ablations=["figure1"],
+        num_seeds=0,
+        overrides=["--config.seed=3", "--config.batchsize=7"],
+    )
+    expected = (
+        "--methods='gail' is unknown",
+        "--ablation='figure1' is unknown",
+        "--seeds=0 must be at least 1",
+        "can't be written",
+        "--config.seed=3 is what the sweep itself sets: use --seeds",
+        "field='batchsize' is unknown; did you mean: batch_size",
+    )
+    for fault, words in zip(told, expected, strict=True):
+        assert words in fault
+    assert "[" not in told[-1]  # all runs have it
+
+
+def test_a_fault_of_some_runs_says_which(tmp_path):
+    (fault,) = _faults(
+        tmp_path, lambda config: ["no demonstrations"] * (config.task == "walker_run")
+    )
+    assert fault == "no demonstrations [walker_run/pdac, walker_run/psil]"
+
+
+def test_a_folder_with_another_run_is_refused(tmp_path):
+    (run, *_) = _runs(tmp_path, methods=["pdac"], tasks=["walker_run"])
+    config = plan.read_config(run.command)
+    config.batch_size = 17
+    run.folder.mkdir(parents=True)
+    plan.workdir.write_config(run.folder, config, {})
+    (fault,) = _faults(tmp_path, methods=["pdac"], tasks=["walker_run"])
+    assert "batch_size: 17 there, 256 here" in fault
+    assert fault.endswith("[walker_run/pdac/seed0]")
+
+
+def test_clusters_that_are_not_there(monkeypatch):
+    monkeypatch.setattr(clusters.shutil, "which", lambda name: None)
+    monkeypatch.setattr(clusters.importlib.util, "find_spec", lambda name: None)
+    many = Cluster("slurm", num_workers=10**6, hours=0.0, num_gpus=2, num_cpus=0)
+    told = "\n".join(clusters.problems(many, starts=True))
+    for words in ("no Slurm here", "jaxil[cluster]", "--workers=", "--hours=0.0",
+                  "--gpus=2", "--cpus=0"):  # fmt: skip
+        assert words in told
+    assert not list(clusters.problems(Cluster("slurm"), starts=False))
+    (fault,) = clusters.problems(Cluster("pbs"), starts=True)
+    assert "local, slurm, debug" in fault
+
+
+def test_wrong_use_of_the_command_ends_with_status_2(tmp_path):
+    done = _sweep("--methods=gail", "--seeds=0", "--cluster=pbs", "--tasks=walker_wlak")
+    assert done.returncode == 2
+    for words in ("gail", "--seeds=0", "'pbs'", "--workdir is missing"):
+        assert words in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+# Shares of a machine.
+
+
+def test_cores_and_gpus_are_shared_out(monkeypatch):
+    monkeypatch.setattr(clusters.os, "sched_getaffinity", lambda _: set(range(3, 11)))
+    monkeypatch.setattr(clusters.platform, "uses_cpu", lambda: True)
+    two = clusters.places(Cluster("local", num_workers=2), 10)
+    assert [place.cores for place in two] == [(3, 4, 5, 6), (7, 8, 9, 10)]
+    assert len(clusters.places(Cluster("local"), 100)) == 8
+    assert len(clusters.places(Cluster("local"), 3)) == 3
+    monkeypatch.setattr(clusters.platform, "uses_cpu", lambda: False)
+    monkeypatch.setattr(clusters.platform, "has_cuda_device", lambda: True)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,6")
+    one_each = clusters.places(Cluster("local"), 10)
+    assert [dict(place.environment) for place in one_each] == [
+        {"CUDA_VISIBLE_DEVICES": "4"},
+        {"CUDA_VISIBLE_DEVICES": "6"},
+    ]
+    assert len(one_each[0].cores or ()) == 4
+    shared = clusters.places(Cluster("local", num_workers=4), 10)
+    assert dict(shared[3].environment) == {
+        "CUDA_VISIBLE_DEVICES": "6",
+        "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.45",
+    }
+
+
+# What a run's folder tells.
+
+
+def test_states_of_a_run(tmp_path):
+    run = stand_in(tmp_path, "one", episodes=10, seconds=0.0)
+    assert state.status(run) == Status(State.MISSING, 0, 0.0, None)
+    state.note_slurm_job(run, "7_0")
+    assert state.status(run, frozenset({"7_0"})).state is State.QUEUED
+    assert state.status(run, frozenset({"7_1"})).state is State.MISSING
+    (run.folder / "config.json").write_text("{}")
+    header = "frame,seconds\n"
+    (run.folder / "train.csv").write_text(header)
+    assert state.status(run).frame == 0
+    (run.folder / "train.csv").write_text(header + "8000,40.0\n9000,45.0\n10000,5")
+    status = state.status(run)  # the last line was cut off
+    assert (status.state, status.frame) == (State.PARTLY_DONE, 9000)
+    assert status.frames_per_second == 200.0
+    state.note_failure(run, 3)
+    assert (state.status(run).state, state.failure(run)) == (State.FAILED, 3)
+    with state.claimed(run) as claim, state.claimed(run) as second:
+        assert claim is not None
+        assert second is None
+        assert state.status(run).state is State.RUNNING
+    (run.folder / "checkpoints" / "frame_000000010000").mkdir(parents=True)
+    assert state.status(run).state is State.FINISHED
+    # Prolonged, it is no longer finished.
+    assert not state.is_finished(run._replace(total_frames=11_000))
+
+
+def test_tables_decide_where_checkpoints_were_cleared_away(tmp_path):
+    run = stand_in(tmp_path, "one", episodes=1, seconds=0.0)
+    run.folder.mkdir(parents=True)
+    for name, frame in (("train.csv", 1000), ("eval.csv", 900)):
+        (run.folder / name).write_text(f"frame,seconds\n{frame},1\n")
+    assert not state.is_finished(run)
+    (run.folder / "eval.csv").write_text("frame,seconds\n1000,1\n")
+    assert state.is_finished(run)
+
+
+def test_a_run_hears_what_the_worker_listens_for():
+    run = object.__new__(train.Run)
+    said = []
+    run.stop_asked = False
+    run.progress = types.SimpleNamespace(message=said.append)  # type: ignore[assignment]
+    assert run.ask_to_stop("SIGTERM")
+    assert HAS_HEARD in said[0]
+
+
+def test_cost_by_hand(tmp_path):
+    one, two, three = (
+        stand_in(tmp_path, name, episodes=10, seconds=0.0) for name in "abc"
+    )
+    other = three._replace(method="drqv2")
+    statuses = {
+        one: Status(State.FINISHED, 10_000, 100.0, 5.0),
+        two: Status(State.PARTLY_DONE, 4_000, 80.0, None),
+        three: Status(State.MISSING, 0, 0.0, None),
+        other: Status(State.MISSING, 0, 0.0, None),
+    }
+    left = cost.estimate(statuses, guess=10.0)
+    # two goes on at its own 50 frames/s, three at the median 75, other at the guess.
+    assert left.frames == 26_000
+    assert left.seconds == pytest.approx(6000 / 50 + 10_000 / 75 + 10_000 / 10)
+    assert left.guessed_methods == ("drqv2",)
+    assert "17 min with 2 at a time (a guess" in cost.sentence(left, 2, 10.0)
+
+
+# Runs on this machine, done by a stand-in for the training.
+
+
+def test_one_failure_stops_nothing_and_is_tried_again_by_the_next_sweep(
+    tmp_path, capsys
+):
+    bad = stand_in(tmp_path, "bad", episodes=3, seconds=0.1, extra="--fail")
+    runs = [bad, *(_quick(tmp_path, name) for name in ("one", "two", "three"))]
+    assert _start(runs, tmp_path).wait(_SECONDS) == 0
+    statuses = {run: state.status(run) for run in runs}
+    assert tables.summary(statuses) == "1 failed, 3 finished"
+    tables.print_failures(statuses)
+    shown = capsys.readouterr().out
+    assert "bad/zero/seed0 failed (exit status 3)" in shown
+    assert "the reason of the failure" in shown
+    again = [bad._replace(command=_quick(tmp_path, "bad").command), *runs[1:]]
+    clusters.start(Cluster("debug"), again, tmp_path, lambda: None)
+    for run in again:
+        _check_rows(run, processes=1)
+
+
+def test_a_run_gets_the_cores_of_its_place(tmp_path):
+    run = stand_in(tmp_path, "one", episodes=1, seconds=0.0, extra="--place")
+    assert _start([run], tmp_path).wait(_SECONDS) == 0
+    cores = sorted(os.sched_getaffinity(0))
+    place = f"place {cores} {len(cores)}"
+    assert place in (run.folder / "log.txt").read_text()
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_an_interrupted_sweep_goes_on_and_repeats_nothing(tmp_path, number):
+    runs = [
+        stand_in(tmp_path, name, episodes=25, seconds=0.1) for name in ("one", "two")
+    ]
+    process = _start(runs, tmp_path)
+    _wait_for(lambda: state.status(runs[1]).frame >= 7 * FRAMES)
+    if number == signal.SIGINT:  # as a terminal does: to all of its processes
+        os.killpg(process.pid, number)
+    else:
+        process.send_signal(number)
+    # The runs notice by themselves, save and end.
+    _wait_for(lambda: not any(state.is_in_use(run) for run in runs))
+    process.wait()
+    assert state.is_finished(runs[0])
+    done = state.status(runs[1]).frame // FRAMES
+    assert 7 <= done < 25
+    assert state.status(runs[1]).state is State.PARTLY_DONE
+    assert _start(runs, tmp_path).wait(_SECONDS) == 0
+    assert f"from episode {done}\n" in (runs[1].folder / "log.txt").read_text()
+    _check_rows(runs[0], processes=1)
+    _check_rows(runs[1], processes=2)
+
+
+def test_a_run_that_outlives_its_sweep_is_left_to_finish(tmp_path):
+    run = stand_in(tmp_path, "one", episodes=30, seconds=0.1)
+    process = _start([run], tmp_path)
+    _wait_for(lambda: state.status(run).frame >= 3 * FRAMES)
+    os.killpg(process.pid, signal.SIGKILL)  # sweep, submitit and worker at once
+    process.wait()
+    assert state.status(run).state is State.RUNNING
+    assert _start([run], tmp_path).wait(_SECONDS) == 0
+    _check_rows(run, processes=1)
+
+
+def test_a_process_is_known_again():
+    child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    seen = Process(child.pid, Process.current().started)
+    assert not seen.is_alive()  # the same number, but another time
+    assert Process.current().is_alive()
+    child.communicate(b"\n")
+
+
+# A minute on a busy machine: two starts of the real command.
+def test_real_runs_from_the_plan_to_the_table(tmp_path):
+    flags = [
+        *("--methods=drqv2", "--preset=tiny", "--tasks=ball_in_cup_catch"),
+        *("--seeds=1", "--workers=1", f"--workdir={tmp_path}", *SMALL),
+        *("--config.observation=state", "--config.encoder.subtract_mean_image=False"),
+        "--config.total_frames=2000",
+    ]
+    planned = _sweep(*flags, "--dry_run")
+    assert planned.returncode == 0, planned.stderr
+    assert "1 missing" in planned.stdout
+    assert "jaxil.launch --config=configs/tiny.py:drqv2,ball_in" in planned.stdout
+    assert not list(tmp_path.iterdir())
+    done = _sweep(*flags)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "seed0: finished, return" in done.stdout
+    home = tmp_path / "ball_in_cup_catch" / "drqv2" / "seed0"
+    before = (home / "train.csv").stat().st_mtime_ns
+    watched = _sweep(*flags, "--watch")
+    assert "2,000/2,000" in watched.stdout
+    again = _sweep(*flags)
+    assert again.returncode == 0
+    assert "1 finished" in again.stdout
+    assert (home / "train.csv").stat().st_mtime_ns == before
+
+
+def _sweep(*flags: str):
+    return subprocess.run(
+        [sys.executable, "launch/sweep.py", *flags],
+        cwd=ROOT,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+    )
+
+
+def _quick(folder, name):
+    return stand_in(folder, name, episodes=3, seconds=0.02)
+
+
+_SWEEP = """
+import pathlib, pickle, signal, sys
+from launch.sweeps import clusters
+def stop(number, frame):
+    raise KeyboardInterrupt
+signal.signal(signal.SIGTERM, stop)
+folder = pathlib.Path(sys.argv[1])
+runs = pickle.loads((folder / "runs").read_bytes())
+clusters.start(clusters.Cluster("local", num_workers=1), runs, folder, lambda: None)
+"""
+
+
+def _start(runs, folder: pathlib.Path) -> subprocess.Popen:
+    """Starts a local sweep as a process group of its own."""
+    (folder / "runs").write_bytes(pickle.dumps(runs))
+    return subprocess.Popen(
+        [sys.executable, "-c", _SWEEP, str(folder)],
+        cwd=ROOT,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+
+
+def _check_rows(run, processes: int) -> None:
+    """Checks that no episode is missing or was written twice."""
+    assert state.is_finished(run)
+    table = read_csv(run.folder / "train.csv")
+    assert list(table["frame"]) == list(range(FRAMES, run.total_frames + 1, FRAMES))
+    assert len(set(table["process"])) == processes
+
+
+def _wait_for(condition) -> None:
+    end = time.monotonic() + _SECONDS
+    while not condition():
+        assert time.monotonic() < end, "too slow"
+        time.sleep(0.05)
