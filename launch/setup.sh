@@ -173,8 +173,9 @@ apt_install() { # PACKAGES...
     "${sudo[@]}" dpkg --configure -a || true
     "${apt[@]}" update || true
     for package in "$@"; do
-      # Newer distributions have dropped libosmesa6; EGL does without it.
-      if [[ $package != libosmesa6 ]] || apt-cache show libosmesa6; then
+      # Newer distributions have dropped libosmesa6; EGL does without it. Ubuntu has
+      # another way to bring chromium.
+      if [[ $package != @(libosmesa6|chromium) ]] || apt-cache show "$package"; then
         packages+=("$package")
       fi
     done

@@ -5,13 +5,31 @@
 #       ruff, ruff format, pyright, then all tests
 #   bash launch/test.sh tests/maths -k shift
 #       pytest with these arguments, seen from the project's root
+#
+# Where it may, it also installs Slurm and Chromium, which a few tests start.
 
 set -euo pipefail
 
 # shellcheck source-path=SCRIPTDIR source=setup.sh
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
 
+# Programs that some tests start; those tests are skipped, and say so, without them.
+install_test_packages() {
+  local packages=() PATH=$PATH:/usr/sbin
+  command -v slurmctld >/dev/null || packages+=(slurm-wlm)
+  command -v chromium chromium-browser google-chrome >/dev/null ||
+    packages+=(chromium)
+  if ((${#packages[@]} == 0)); then
+    return
+  fi
+  say "Installing ${packages[*]} with apt-get, for a few tests (about a minute)."
+  (apt_install "${packages[@]}") 2>/dev/null ||
+    say "That failed, so these tests are skipped; root can \`apt-get install" \
+      "${packages[*]}\`."
+}
+
 set_up dev
+install_test_packages
 export PATH=$venv/bin:$PATH
 
 failed=()

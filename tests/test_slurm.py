@@ -22,9 +22,11 @@ from tests.trainer import FRAMES, stand_in
 _DAEMONS = ("slurmctld", "slurmd")
 _SECONDS = 120.0  # for what takes ten on an idle machine
 
-_reason = next((f"{d} is not installed" for d in _DAEMONS if not shutil.which(d)), "")
-if not _reason and os.geteuid() != 0:
-    _reason = "only root can start jobs"
+_missing = [daemon for daemon in _DAEMONS if not shutil.which(daemon)]
+if os.geteuid() != 0:
+    _reason = "only root can start a cluster of its own"
+else:
+    _reason = f"{_missing[0]} is not installed (package slurm-wlm)" if _missing else ""
 pytestmark = pytest.mark.skipif(bool(_reason), reason=f"no Slurm here: {_reason}")
 
 
