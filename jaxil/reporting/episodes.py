@@ -129,8 +129,9 @@ def _sheet(
         draw = functools.partial(
             plots.rewards, imitation=imitation, task=task, colour=colour
         )
-        panels.append(Panel("rewards of the episode", draw, _REWARD_HEIGHT))
+        panels.append(Panel("rewards", draw, _REWARD_HEIGHT, plots.REWARD_MARGINS))
     if plan.size:
         draw = functools.partial(plots.plan, weights=plan)
-        panels.append(Panel("transport plan", draw, _PLAN_HEIGHT))
+        # Below the rewards, at the same place: one step is one height.
+        panels.append(Panel("transport plan", draw, _PLAN_HEIGHT, plots.REWARD_MARGINS))
     return Sheet(name, tuple(panels)) if panels else None

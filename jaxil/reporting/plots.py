@@ -13,6 +13,8 @@ _DOTTED = 40  # points; a line with fewer shows each of them
 _LABEL_WIDTH = 58  # characters above a bar
 _BAR_LINES = 1.8  # of text, that a bar takes
 _LINE_HEIGHT = 0.145  # inches
+# Left and right of the axes, in inches.
+BAR_MARGINS, REWARD_MARGINS = (0.1, 0.2), (0.72, 0.62)
 # Beyond this many times the height of the means, an interval is cut off.
 _BAND_ROOM = 1.25
 

@@ -109,6 +109,7 @@ def bar_sheet(study: Study, finals: Sequence[Final], *, name: str) -> Sheet | No
                 plots.bars, finals=some, looks=study.looks, extent=extent
             ),
             plots.bars_height(extent),
+            plots.BAR_MARGINS,
         )
         for task, some in tasks.items()
     ]

@@ -139,9 +139,9 @@ def read(folder: pathlib.Path) -> Run:
     nested, device = stored["config"], str(stored.get("device", "unknown"))
     remarks: list[str] = []
     evaluation = _read_table(folder / "eval.csv", _RETURN, remarks)
-    training = _read_table(folder / "train.csv", None, remarks)
-    if "frame" in evaluation and not len(evaluation["frame"]) and not remarks:
+    if not len(evaluation[_RETURN]) and not remarks:
         remarks.append("no evaluation yet")
+    training = _read_table(folder / "train.csv", None, remarks)
     return Run(
         folder=folder,
         name=folder.as_posix(),

@@ -8,10 +8,15 @@ from typing import Any, NamedTuple
 
 from jaxil.reporting.appearance import INK, Look
 
-_WIDTH, _HEIGHT = 4.3, 2.85  # inches of a panel
+# In inches. Places are computed, not found by Matplotlib's layout engines, which take
+# twice as long as all the drawing.
+_WIDTH, _HEIGHT = 4.3, 2.85  # of a panel
+_MARGINS = (0.64, 0.14)  # left and right of the axes
+_TOP, _TITLE, _BOTTOM = 0.12, 0.24, 0.46  # above and below them
+_LEGEND_LINE = 0.19
 _COLUMNS = 3
-_LEGEND_WIDTH = 32  # characters; with a longer label, one below the other
-_SETTINGS = {
+_LEGEND_WIDTH = 42  # characters; with a longer label, one below the other
+_SETTINGS: dict[Any, Any] = {
     "font.family": ["DejaVu Sans"],  # comes with Matplotlib
     "font.size": 8.5,
     "axes.titlesize": 10,
@@ -38,11 +43,13 @@ class Panel(NamedTuple):
       title: such as the task.
       draw: draws it onto Matplotlib's axes.
       height: in inches.
+      margins: left and right of the axes, in inches.
     """
 
     title: str
     draw: Callable[[Any], None]
     height: float = _HEIGHT
+    margins: tuple[float, float] = _MARGINS
 
 
 class Sheet(NamedTuple):
@@ -69,7 +76,7 @@ def inline_svg(panel: Panel, prefix: str) -> str:
       prefix: of all ids in it, unique on the page.
     """
     with _context({"svg.fonttype": "none"}):
-        figure, axes = _figure(1, 1, panel.height)
+        figure, axes = _figure([panel], title=0.0)
         panel.draw(axes[0])
         text = _saved(figure, "svg", transparent=True).decode()
     text = text[text.index("<svg") :]
@@ -85,20 +92,11 @@ def inline_svg(panel: Panel, prefix: str) -> str:
 
 def write(sheet: Sheet, folder: pathlib.Path) -> None:
     """Writes NAME.png and NAME.svg."""
-    columns = min(_COLUMNS, len(sheet.panels))
-    rows = -(-len(sheet.panels) // columns)
-    height = max(panel.height for panel in sheet.panels) + 0.25
     with _context({"svg.fonttype": "path"}):
-        figure, axes = _figure(rows, columns, height, sheet.legend)
-        for place, ax in enumerate(axes):
-            if place < len(sheet.panels):
-                sheet.panels[place].draw(ax)
-                ax.set_title(sheet.panels[place].title)
-            else:
-                ax.set_axis_off()
-        # Laid out once for both.
-        figure.draw_without_rendering()
-        figure.set_layout_engine("none")
+        figure, axes = _figure(sheet.panels, sheet.legend, title=_TITLE)
+        for panel, ax in zip(sheet.panels, axes, strict=True):
+            panel.draw(ax)
+            ax.set_title(panel.title)
         for kind in ("png", "svg"):
             (folder / f"{sheet.name}.{kind}").write_bytes(_saved(figure, kind))
 
@@ -113,33 +111,46 @@ def swatch(look: Look) -> str:
     )
 
 
-def _context(more: dict[str, Any]) -> Any:
+def _context(more: dict[Any, Any]) -> Any:
     import matplotlib
 
     return matplotlib.rc_context({**_SETTINGS, **more})
 
 
 def _figure(
-    rows: int,
-    columns: int,
-    height: float,
+    panels: Sequence[Panel],
     legend: Sequence[tuple[str, Look]] = (),
+    *,
+    title: float,
 ) -> tuple[Any, list[Any]]:
+    """Returns a figure with axes for each panel, all equally high, and its legend."""
     # Not pyplot: a Figure of one's own needs no display and leaves no global state.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-    long = any(len(label) > _LEGEND_WIDTH for label, _ in legend)
-    legend_columns = 1 if long else columns
-    legend_rows = -(-len(legend) // legend_columns)
-    size = (_WIDTH * columns, height * rows + 0.2 * legend_rows)
-    figure = Figure(
-        figsize=size,
-        dpi=150,
-        layout="constrained" if legend or rows * columns > 1 else "tight",
-    )
+    columns = min(_COLUMNS, len(panels))
+    rows = -(-len(panels) // columns)
+    is_long = any(len(label) > _LEGEND_WIDTH for label, _ in legend)
+    legend_columns = 1 if is_long else columns
+    legend_height = _LEGEND_LINE * -(-len(legend) // legend_columns)
+    cell = max(panel.height for panel in panels) + title
+    width, height = _WIDTH * columns, cell * rows + legend_height
+    figure = Figure(figsize=(width, height), dpi=150)
     FigureCanvasAgg(figure)
+    axes = []
+    for place, panel in enumerate(panels):
+        row, column = divmod(place, columns)
+        left, right = panel.margins
+        corner = (column * _WIDTH + left, height - (row + 1) * cell + _BOTTOM)
+        size = (_WIDTH - left - right, cell - title - _TOP - _BOTTOM)
+        box = (
+            corner[0] / width,
+            corner[1] / height,
+            size[0] / width,
+            size[1] / height,
+        )
+        axes.append(figure.add_axes(box))
     if legend:
         handles = [
             Line2D([], [], color=look.colour, ls=look.line, lw=1.8, label=label)
@@ -147,13 +158,13 @@ def _figure(
         ]
         figure.legend(
             handles=handles,
-            loc="outside lower left",
+            loc="lower left",
             ncols=legend_columns,
             frameon=False,
             fontsize=8,
             handlelength=3,
         )
-    return figure, list(figure.subplots(rows, columns, squeeze=False).ravel())
+    return figure, axes
 
 
 def _saved(figure: Any, kind: str, *, transparent: bool = False) -> bytes:
