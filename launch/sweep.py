@@ -52,8 +52,11 @@ def main(argv: list[str]) -> int:
     todo = [run for run in runs if statuses[run].state not in away]
     tables.print_plan(statuses)
     guess = cost.guessed_speed(values.preset, on_gpu=clusters.uses_gpus(cluster))
-    left = cost.estimate(statuses, guess)
-    print(cost.sentence(left, clusters.num_at_once(cluster, len(todo)), guess))
+    if todo:
+        left = cost.estimate({run: statuses[run] for run in todo}, statuses, guess)
+        print(cost.sentence(left, clusters.num_at_once(cluster, len(todo)), guess))
+    else:
+        print("Nothing is left to start.")
     if values.dry_run:
         print(*(shlex.join(run.command) for run in todo), sep="\n")
         return 0

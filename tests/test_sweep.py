@@ -189,6 +189,7 @@ def test_cores_and_gpus_are_shared_out(monkeypatch):
     assert [place.cores for place in two] == [(3, 4, 5, 6), (7, 8, 9, 10)]
     assert len(clusters.places(Cluster("local"), 100)) == 8
     assert len(clusters.places(Cluster("local"), 3)) == 3
+    assert clusters.places(Cluster("local"), 0) == []
     monkeypatch.setattr(clusters.platform, "uses_cpu", lambda: False)
     monkeypatch.setattr(clusters.platform, "has_cuda_device", lambda: True)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,6")
@@ -264,7 +265,8 @@ def test_cost_by_hand(tmp_path):
         three: Status(State.MISSING, 0, 0.0, None),
         other: Status(State.MISSING, 0, 0.0, None),
     }
-    left = cost.estimate(statuses, guess=10.0)
+    todo = {run: statuses[run] for run in (two, three, other)}
+    left = cost.estimate(todo, statuses, guess=10.0)
     # two goes on at its own 50 frames/s, three at the median 75, other at the guess.
     assert left.frames == 26_000
     assert left.seconds == pytest.approx(6000 / 50 + 10_000 / 75 + 10_000 / 10)

@@ -101,7 +101,7 @@ def places(cluster: Cluster, num_runs: int) -> list[Place]:
         return [Place()]
     fitting = 1 if uses_gpus(cluster) else len(cores)
     number = min(cluster.num_workers or len(gpus) or fitting, num_runs)
-    share = max(len(cores) // number, 1)
+    share = len(cores) // max(number, 1)
     made = []
     for i in range(number):
         environment = []

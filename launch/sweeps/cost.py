@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from jaxil.host.progress import duration
 from launch.sweeps.plan import Run
-from launch.sweeps.state import State, Status
+from launch.sweeps.state import Status
 
 # Frames per second of one run at a time, where none has been measured. On the CPU, as
 # the README's measurements; of GPUs no run is known yet.
@@ -35,20 +35,21 @@ class Cost(NamedTuple):
     guessed_methods: tuple[str, ...]
 
 
-def estimate(statuses: Mapping[Run, Status], guess: float) -> Cost:
+def estimate(
+    todo: Mapping[Run, Status], statuses: Mapping[Run, Status], guess: float
+) -> Cost:
     """Estimates what is left.
 
     Args:
-      statuses: of all runs of the sweep.
+      todo: the runs to be done.
+      statuses: of all runs of the sweep, which show how fast it goes.
       guess: frames per second of a method that has not run here.
     """
     by_task, by_method = _speeds(statuses)
     frames, seconds, longest = 0, 0.0, 0.0
     guessed: dict[str, None] = {}
-    for run, status in statuses.items():
+    for run, status in todo.items():
         left = max(run.total_frames - status.frame, 0)
-        if status.state is State.FINISHED or not left:
-            continue
         speed = by_task.get((run.task, run.method), by_method.get(run.method))
         if speed is None:
             guessed[run.method] = None
