@@ -106,7 +106,7 @@ def importable(monkeypatch):
     "signals", [["USR2"], ["TERM", "USR2"]], ids=["timeout", "preemption"]
 )
 def test_a_warned_job_saves_is_queued_again_and_goes_on(tmp_path, signals):
-    run = stand_in(tmp_path, "warned", episodes=42, seconds=0.2)
+    run = stand_in(tmp_path, "warned", episodes=42, seconds=0.2, extra="--slow")
     _submit([run], tmp_path)
     job = state.slurm_job(run)
     assert job is not None

@@ -47,6 +47,7 @@ def main() -> int:
     parser.add_argument("episodes", type=int)
     parser.add_argument("seconds", type=float)
     parser.add_argument("--fail", action="store_true", help="ends with status 3")
+    parser.add_argument("--slow", action="store_true", help="takes 5 s to save")
     parser.add_argument("--place", action="store_true", help="prints cores and limits")
     flags = parser.parse_args()
     try:
@@ -86,6 +87,8 @@ def _train(flags: argparse.Namespace) -> int:
             time.sleep(flags.seconds)
             frame = episode * FRAMES
             table.append({"frame": frame, "seconds": episode, "process": os.getpid()})
+            if asked and flags.slow:
+                time.sleep(5.0)
             if episode % _EVERY == 0 or episode == flags.episodes or asked:
                 (checkpoints / f"frame_{frame:012d}").mkdir(parents=True)
             if asked:
