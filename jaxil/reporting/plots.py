@@ -238,7 +238,7 @@ def _horizontal(axes: Any, right: float, over: str) -> None:
     from matplotlib.ticker import EngFormatter, MaxNLocator
 
     axes.set_xlim(0, 1.02 * right if right > 0 else 1.0)
-    axes.xaxis.set_major_locator(MaxNLocator(6))
+    axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
     if over == "frame":
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.set_xlabel("environment frames")

@@ -16,6 +16,7 @@ from jaxil.host import metrics
 # Large folders of a run in which no other run can be.
 _OWN_FOLDERS = ("checkpoints", "replay", "tensorboard", "videos")
 _RETURN = "task_return_mean"
+_FAILED = "failed.json"  # of launch/sweep.py
 # What a run of this jaxil writes; anything else is a damaged file.
 _NEEDED = {"method": str, "task": str, "seed": int, "total_frames": int}
 
@@ -114,7 +115,10 @@ class Run(NamedTuple):
 
 
 def find(roots: Iterable[pathlib.Path]) -> list[pathlib.Path]:
-    """Returns every folder with a config.json at or below `roots`, each one once.
+    """Returns every folder of a run at or below `roots`, each one once.
+
+    That is a folder with a config.json, or with the failed.json that a sweep writes for
+    a run that ended before it had one.
 
     Args:
       roots: folders that exist.
@@ -123,7 +127,7 @@ def find(roots: Iterable[pathlib.Path]) -> list[pathlib.Path]:
     for root in roots:
         for path, folders, files in os.walk(root):
             folder = pathlib.Path(path)
-            if "config.json" in files:
+            if "config.json" in files or _FAILED in files:
                 found.setdefault(folder.resolve(), folder)
                 folders[:] = [name for name in folders if name not in _OWN_FOLDERS]
     return sorted(found.values())
@@ -138,8 +142,10 @@ def read(folder: pathlib.Path) -> Run:
     stored = _read_config(folder / "config.json")
     nested, device = stored["config"], str(stored.get("device", "unknown"))
     remarks: list[str] = []
+    if (folder / _FAILED).exists():
+        remarks.append(f"failed, {_exit_status(folder)}; its log says why")
     evaluation = _read_table(folder / "eval.csv", _RETURN, remarks)
-    if not len(evaluation[_RETURN]) and not remarks:
+    if not len(evaluation[_RETURN]) and not any("eval.csv" in r for r in remarks):
         remarks.append("no evaluation yet")
     training = _read_table(folder / "train.csv", None, remarks)
     return Run(
@@ -181,7 +187,10 @@ def _read_config(path: pathlib.Path) -> dict[str, Any]:
     try:
         stored = json.loads(path.read_text())
     except OSError as error:
-        raise UnreadableError(f"can't be read ({error.strerror})") from error
+        failed = (path.parent / _FAILED).exists()
+        why = f"the run failed, {_exit_status(path.parent)}" if failed else ""
+        why = why or str(error.strerror)
+        raise UnreadableError(f"can't be read ({why})") from error
     except (ValueError, RecursionError) as error:
         raise UnreadableError(f"is damaged ({error})") from error
     config = stored.get("config") if isinstance(stored, dict) else None
@@ -197,6 +206,14 @@ def _read_config(path: pathlib.Path) -> dict[str, Any]:
     for field, value in _defaults(config["method"], config["task"]).items():
         _check_kind(config, field, value)
     return stored
+
+
+def _exit_status(folder: pathlib.Path) -> str:
+    try:
+        status = json.loads((folder / _FAILED).read_text())["exit_status"]
+    except (OSError, ValueError, KeyError, TypeError):
+        status = "unknown"
+    return f"exit status {status}"
 
 
 def _check_kind(config: Mapping[str, Any], field: str, default: Any) -> None:

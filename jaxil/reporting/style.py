@@ -43,7 +43,7 @@ th { font-weight: 600; vertical-align: bottom; white-space: nowrap; cursor: poin
   user-select: none; }
 th[aria-sort=ascending]::after { content: " \\2191"; }
 th[aria-sort=descending]::after { content: " \\2193"; }
-td.long { min-width: 24rem; }
+td.medium { min-width: 12rem; } td.long { min-width: 24rem; }
 td:not(.number) { overflow-wrap: break-word; }
 .number { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
 figure { margin: .6rem 0 1.2rem; }

@@ -10,7 +10,7 @@ import numpy as np
 
 Kind = Literal["text", "count", "return", "share", "hours"]
 _MISSING = "–"
-_LONG = 60  # characters; a cell with more needs room
+_MEDIUM, _LONG = 16, 60  # characters; a cell with more needs room
 
 
 class Column(NamedTuple):
@@ -69,9 +69,15 @@ def _row(columns: Sequence[Column], row: Sequence[Any]) -> str:
     for column, cell in zip(columns, row, strict=True):
         key = "" if _is_missing(cell) else html.escape(str(_exact(cell)), quote=True)
         text = html.escape(_shown(cell, column.kind))
-        long = ' class="long"' if len(text) > _LONG else ""
-        cells.append(f'<td{_align(column) or long} data-sort="{key}">{text}</td>')
+        kind = _align(column) or _room(text)
+        cells.append(f'<td{kind} data-sort="{key}">{text}</td>')
     return "".join(cells)
+
+
+def _room(text: str) -> str:
+    if len(text) > _LONG:
+        return ' class="long"'
+    return ' class="medium"' if len(text) > _MEDIUM else ""
 
 
 def _align(column: Column) -> str:

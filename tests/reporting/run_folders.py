@@ -77,7 +77,7 @@ def film(folder: pathlib.Path, frame: int, *, plan: bool) -> None:
     frames = np.broadcast_to(ramp[:, None, None, None], (30, 32, 32, 3))
     path = videos / f"frame_{frame:09d}.mp4"
     video.write_video(path, frames, frames[::-1], fps=15)
-    arrays = {
+    arrays: dict[str, Any] = {
         "imitation_rewards": -np.linspace(0.5, 0.1, 29, dtype=np.float32),
         "task_rewards": np.linspace(0, 1, 29, dtype=np.float32),
     }

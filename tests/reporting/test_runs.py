@@ -110,6 +110,18 @@ def test_a_config_of_something_else_is_refused(tmp_path, change, expected):
         runs.read(folder)
 
 
+def test_failed_runs_of_a_sweep_are_named(tmp_path):
+    late = write_run(tmp_path / "late", "pdac", "walker_walk", 0, {1000: 1})
+    early = tmp_path / "early"
+    early.mkdir()
+    for folder in (early, late):
+        (folder / "failed.json").write_text('{"exit_status": 3}')
+    assert runs.find([tmp_path]) == [early, late]
+    assert "failed, exit status 3; its log says why" in runs.read(late).remarks
+    with pytest.raises(runs.UnreadableError, match="the run failed, exit status 3"):
+        runs.read(early)
+
+
 @pytest.mark.parametrize("text", ["", "[]", '{"config": 3}', "\xff", "[" * 10**5])
 def test_what_is_no_config_is_refused(tmp_path, text):
     (tmp_path / "config.json").write_text(text)
