@@ -15,15 +15,21 @@ Config = Any
 METHODS = {
     "pdac": "adversarial rewards on the critic's features (P-DAC)",
     "psil": "optimal transport to the closest demonstration (P-SIL)",
+    "dac": "adversarial rewards on pixels and actions (DAC)",
+    "sil": "optimal transport in an adversarial embedding (SIL)",
+    "bc": "the expert's actions, copied (behavioural cloning)",
     "drqv2": "the environment's own reward (DrQ-v2)",
     "zero": "no reward at all: the control",
 }
 OBSERVATIONS = ("pixels", "state")
+COSTS = ("cosine", "euclidean")
+ALIGNMENTS = ("transport", "time")
 RENDER_QUALITIES = ("paper", "fast", "smooth")
 
 # The paper's budgets, in environment frames; other tasks get the larger one.
 _EASY_TASKS = ("cartpole_swingup", "finger_spin", "ball_in_cup_catch")
 _EASY_FRAMES, _HARD_FRAMES = 1_500_000, 5_000_000
+_CLONING_UPDATES = 55_000  # in the reference
 
 _SHORT_LIST = 12  # names that a message may list in full
 
@@ -80,20 +86,30 @@ def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Conf
     config.demonstrations.num_episodes = 10
     config.demonstrations.frame_skip = 1  # of pixel files: every so many-th frame
 
-    # P-SIL.
+    # P-SIL and SIL; what is paired, and by which cost, is the paper's figure 7.
     config.sinkhorn = ml_collections.ConfigDict()
+    config.sinkhorn.cost = "cosine"  # or "euclidean"
+    config.sinkhorn.alignment = "transport"  # or "time": moment t with moment t
     config.sinkhorn.epsilon = 0.01
     config.sinkhorn.num_iterations = 100
     config.sinkhorn.target_update_steps = 10_000
     config.sinkhorn.return_scale = 10.0  # the first episode returns minus this
 
-    # P-DAC.
+    # P-DAC, DAC, and the embedding of SIL, which is an adversary too.
     config.discriminator = ml_collections.ConfigDict()
     config.discriminator.hidden_dim = 1024
     config.discriminator.learning_rate = 1e-4
     config.discriminator.gradient_penalty = 10.0
     config.discriminator.batch_size = 128
     config.discriminator.sees_actions = False
+
+    # BC. It plays no episode: its frames count updates as other methods' would.
+    config.cloning = ml_collections.ConfigDict()
+    config.cloning.batch_size = 128
+    config.cloning.std = 0.1  # of the policy whose likelihood is raised
+    if method == "bc":
+        per_update = config.update_every_steps * config.action_repeat
+        config.total_frames = _CLONING_UPDATES * per_update
 
     # Looking at it.
     config.eval_every_frames = 10_000
@@ -105,12 +121,14 @@ def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Conf
 
 def uses_demonstrations(config: Config) -> bool:
     """Says whether a run of this config reads demonstrations."""
-    return config.method in ("pdac", "psil") or config.encoder.subtract_mean_image
+    return config.method not in ("drqv2", "zero") or config.encoder.subtract_mean_image
 
 
 def sees_actions(config: Config) -> bool:
     """Says whether the method reads the expert's actions."""
-    return config.method == "pdac" and config.discriminator.sees_actions
+    return config.method in ("bc", "dac") or (
+        config.method == "pdac" and config.discriminator.sees_actions
+    )
 
 
 def memory_bytes(config: Config) -> int:
@@ -186,6 +204,8 @@ _RANGES: dict[str, tuple[float, float, str]] = {
     "discriminator.hidden_dim": (1, 10**5, "1024 in the reference"),
     "discriminator.gradient_penalty": (0.0, 1e6, "10 in the paper"),
     "discriminator.batch_size": (1, 65_536, "128 in the reference"),
+    "cloning.batch_size": (1, 65_536, "128 in the reference"),
+    "cloning.std": (1e-6, 10.0, "0.1 in the reference"),
     "eval_every_frames": (1, 10**10, "10000 in DrQ-v2"),
     "num_eval_episodes": (1, 10**4, "10 in DrQ-v2"),
     "checkpoint_every_frames": (1, 10**10, "what a killed run loses at most"),
@@ -217,6 +237,9 @@ def _problems(config: Config, known_tasks: tuple[str, ...]) -> Iterator[str]:
         yield unknown_name("observation", config.observation, OBSERVATIONS)
     if config.render_quality not in RENDER_QUALITIES:
         yield unknown_name("render_quality", config.render_quality, RENDER_QUALITIES)
+    for field, known in (("cost", COSTS), ("alignment", ALIGNMENTS)):
+        if config.sinkhorn[field] not in known:
+            yield unknown_name(f"sinkhorn.{field}", config.sinkhorn[field], known)
     in_range = set()
     for field, (low, high, why) in _RANGES.items():
         value = _read(config, field)
@@ -243,7 +266,7 @@ def _problems(config: Config, known_tasks: tuple[str, ...]) -> Iterator[str]:
         )
     both = {"batch_size", "discriminator.batch_size"} <= in_range
     too_large = both and config.discriminator.batch_size > config.batch_size
-    if config.method == "pdac" and too_large:
+    if config.method in ("pdac", "dac", "sil") and too_large:
         yield (
             f"discriminator.batch_size={config.discriminator.batch_size} is above "
             f"batch_size={config.batch_size}: it reuses the agent's encoded samples; "

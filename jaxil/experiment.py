@@ -18,6 +18,7 @@ from jaxil.host.environment import (
 from jaxil.host.progress import ProgressLine
 from jaxil.host.replay import Replay
 from jaxil.host.states import DemonstrationError
+from jaxil.learner.cloning import make_cloning_step
 from jaxil.learner.policy import Exploit, Explore, make_exploit, make_explore
 from jaxil.learner.state import TrainState
 from jaxil.learner.update import (
@@ -29,7 +30,10 @@ from jaxil.learner.update import (
 from jaxil.maths.types import ExpertEpisodes
 from jaxil.networks.agent import AgentNetworks, make_agent_networks
 from jaxil.rewarders.adversarial import make_adversarial_rewarder
+from jaxil.rewarders.dac import make_dac_rewarder
+from jaxil.rewarders.matching import make_matching
 from jaxil.rewarders.rewarder import Rewarder, Spec
+from jaxil.rewarders.sil import make_sil_rewarder
 from jaxil.rewarders.sinkhorn import make_sinkhorn_rewarder
 from jaxil.rewarders.task import make_task_rewarder, make_zero_rewarder
 
@@ -48,6 +52,7 @@ class Agent(NamedTuple):
       explore: see `policy.make_explore`.
       exploit: see `policy.make_exploit`.
       rewards: the rewarder's, at episode end.
+      plan: the rewarder's, for people; None where it has none.
       rewarder: the method itself.
       init_state: () -> the state before the first update.
     """
@@ -56,6 +61,7 @@ class Agent(NamedTuple):
     explore: Explore
     exploit: Exploit
     rewards: Any
+    plan: Any
     rewarder: Rewarder
     init_state: Any
 
@@ -251,29 +257,53 @@ def mean_image(
 
 def make_rewarder(config: Config, networks: AgentNetworks) -> Rewarder:
     """Returns the imitation method that the config names."""
+    adversary = {
+        "learning_rate": config.discriminator.learning_rate,
+        "batch_size": config.discriminator.batch_size,
+        "frame_stack": stack_size(config),
+    }
     if config.method == "pdac":
         return make_adversarial_rewarder(
             networks,
             hidden_dim=config.discriminator.hidden_dim,
-            learning_rate=config.discriminator.learning_rate,
             penalty_weight=config.discriminator.gradient_penalty,
-            batch_size=config.discriminator.batch_size,
             sees_actions=config.discriminator.sees_actions,
             shift_padding=config.shift_padding,
-            frame_stack=stack_size(config),
+            **adversary,
+        )
+    if config.method == "dac":
+        return make_dac_rewarder(
+            networks,
+            feature_dim=config.feature_dim,
+            hidden_dim=config.discriminator.hidden_dim,
+            penalty_weight=config.discriminator.gradient_penalty,
+            **adversary,
+        )
+    matching = make_matching(
+        cost=config.sinkhorn.cost,
+        alignment=config.sinkhorn.alignment,
+        epsilon=config.sinkhorn.epsilon,
+        num_iterations=config.sinkhorn.num_iterations,
+    )
+    if config.method == "sil":
+        return make_sil_rewarder(
+            networks,
+            matching=matching,
+            feature_dim=config.feature_dim,
+            return_scale=config.sinkhorn.return_scale,
+            **adversary,
         )
     if config.method == "psil":
         return make_sinkhorn_rewarder(
             networks,
-            epsilon=config.sinkhorn.epsilon,
-            num_iterations=config.sinkhorn.num_iterations,
+            matching=matching,
             target_update_steps=config.sinkhorn.target_update_steps,
             return_scale=config.sinkhorn.return_scale,
             frame_stack=stack_size(config),
         )
-    if config.method == "zero":
-        return make_zero_rewarder()
-    return make_task_rewarder()
+    if config.method == "drqv2":
+        return make_task_rewarder()
+    return make_zero_rewarder()
 
 
 def make_agent(
@@ -311,16 +341,21 @@ def make_agent(
         feature_dim=config.feature_dim,
         num_demonstrations=0 if frames is None else frames.shape[0],
         expert_steps=0 if frames is None else frames.shape[1] - 1,
+        observation_shape=environment.observation_spec().shape,
     )
     observation = np.zeros(
         environment.observation_spec().shape, environment.observation_spec().dtype
     )
+    step = make_update_step(learner)
+    if config.method == "bc":
+        step = make_cloning_step(learner, std=config.cloning.std)
     return Agent(
         # The old state is dead after the call, so XLA may reuse its memory.
-        update_step=jax.jit(make_update_step(learner), donate_argnums=0),
+        update_step=jax.jit(step, donate_argnums=0),
         explore=jax.jit(make_explore(networks, schedule)),
         exploit=jax.jit(make_exploit(networks)),
         rewards=jax.jit(rewarder.rewards),
+        plan=None if rewarder.plan is None else jax.jit(rewarder.plan),
         rewarder=rewarder,
         init_state=lambda: init_train_state(
             learner, jax.random.key(config.seed), observation, spec

@@ -1,5 +1,6 @@
 """What a run shows of itself: tables, events, learning curve, videos."""
 
+import io
 import pathlib
 from typing import Any
 
@@ -25,6 +26,7 @@ METRIC_COLUMNS = (
     "discriminator/expert_logit",
     "discriminator/agent_logit",
     "sinkhorn/scale",
+    "sinkhorn/distance",
 )
 # Beyond this mean |pre-tanh|, the gradient of tanh is below 1 %.
 _SATURATED = 3.0
@@ -89,10 +91,32 @@ class Outputs:
             }
         )
 
+    def updates(self, *, frame: int, seconds: float, metrics: dict[str, float]) -> None:
+        """Writes a method's progress down that plays no episodes."""
+        self._pre_tanh = metrics.get("actor/pre_tanh", self._pre_tanh)
+        self._metrics.train(
+            {"frame": frame, "seconds": round(seconds, 3), "episode": 0, **metrics}
+        )
+
     def evaluation(
-        self, evaluation: Evaluation, frame: int, seconds: float, episode: int
+        self,
+        evaluation: Evaluation,
+        frame: int,
+        seconds: float,
+        episode: int,
+        *,
+        distance: float | None,
+        filmed: dict[str, np.ndarray],
     ) -> str:
         """Writes one evaluation down, with picture and video.
+
+        Args:
+          evaluation: what was played.
+          frame: of the run.
+          seconds: of the run.
+          episode: training episodes so far.
+          distance: to the expert, relative to a random policy; None if unknown.
+          filmed: arrays to keep beside the video, see `train.Run.explain`.
 
         Returns:
           One line for people.
@@ -107,6 +131,8 @@ class Outputs:
         }
         if self._expert_return is not None:
             row["expert_task_return_mean"] = self._expert_return
+        if distance is not None:
+            row["wasserstein_to_expert"] = distance
         self._metrics.evaluation(row)
         host_metrics.write_learning_curve(
             self._workdir / "learning_curve.png",
@@ -116,7 +142,7 @@ class Outputs:
             expert_return=self._expert_return,
         )
         if evaluation.video is not None:
-            self._write_video(evaluation.video, frame)
+            self._write_video(evaluation.video, filmed, frame)
         line = (
             f"frame {frame}: task return {evaluation.mean:.1f} ± {evaluation.std:.1f}"
         )
@@ -133,9 +159,16 @@ class Outputs:
         """Flushes and closes the tables."""
         self._metrics.close()
 
-    def _write_video(self, agent_frames: np.ndarray, frame: int) -> None:
+    def _write_video(
+        self, agent_frames: np.ndarray, filmed: dict[str, np.ndarray], frame: int
+    ) -> None:
         folder = self._workdir / "videos"
         folder.mkdir(exist_ok=True)
+        packed = io.BytesIO()
+        np.savez_compressed(packed, **filmed)
+        host_metrics.write_atomically(
+            folder / f"frame_{frame:09d}.npz", packed.getvalue()
+        )
         video.write_video(
             folder / f"frame_{frame:09d}.mp4",
             agent_frames,

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from jaxil import experiment, outputs
+from jaxil.closeness import Closeness
 from jaxil.config import METHODS, Config
 from jaxil.host import demonstrations as host_demonstrations
 from jaxil.host.checkpoint import Checkpoints
@@ -72,6 +73,9 @@ class Run:
         self.agent = experiment.make_agent(config, self.environment, demonstrations)
         self.replay = experiment.make_replay(config, self.environment)
         self.experts = experiment.expert_episodes(self.agent.rewarder, demonstrations)
+        self.closeness = None
+        if demonstrations is not None:
+            self.closeness = Closeness(config, workdir, demonstrations)
         self.counters = Counters()
         self.checkpoints = Checkpoints(workdir, say=say)
         self.stopwatch = Stopwatch()
@@ -103,6 +107,9 @@ class Run:
             played to its end, so that it counts and the last evaluation takes place.
         """
         config, counters = self.config, self.counters
+        if config.method == "bc":
+            self.clone()
+            return
         decisions = interact(
             TimedEnvironment(self.environment, self.stopwatch),
             self.stopwatch.timed("update", self.act),
@@ -129,6 +136,30 @@ class Run:
                     counters.last_checkpoint_step, config.checkpoint_every_frames
                 ):
                     self.save()
+            self.progress.update(self.frame, self.stopwatch.seconds, self.returns)
+
+    def clone(self) -> None:
+        """Trains on the demonstrations alone, without playing.
+
+        Frames go on as if an update took as many of them as in other methods, so that
+        curves of as many updates have the same length.
+        """
+        config, counters = self.config, self.counters
+        while not self.stop_asked and self.frame < config.total_frames:
+            counters.num_steps += config.update_every_steps
+            self.stopwatch.timed("update", self.update)()
+            if self.is_due(counters.last_eval_step, config.eval_every_frames):
+                counters.seconds = time.monotonic() - self.started
+                metrics = {name: float(value) for name, value in self.metrics.items()}
+                self.require_finite(metrics)
+                self.outputs.updates(
+                    frame=self.frame, seconds=counters.seconds, metrics=metrics
+                )
+                self.evaluate()
+            if self.is_due(
+                counters.last_checkpoint_step, config.checkpoint_every_frames
+            ):
+                self.save()
             self.progress.update(self.frame, self.stopwatch.seconds, self.returns)
 
     def ask_to_stop(self, who: str) -> bool:
@@ -167,20 +198,28 @@ class Run:
 
     def update(self) -> None:
         """Samples and learns once."""
-        rng = self._rng(_SAMPLED_BATCHES)
-        batch = Batch(*self.replay.sample(rng, self.config.batch_size))
-        expert = None
-        if self.agent.rewarder.samples_expert:
-            assert self.demonstrations is not None
-            expert = ExpertBatch(
-                *host_demonstrations.sample(
-                    self.demonstrations,
-                    rng,
-                    self.config.discriminator.batch_size,
-                    frame_stack=experiment.stack_size(self.config),
-                )
-            )
+        rng, config = self._rng(_SAMPLED_BATCHES), self.config
+        batch = expert = None
+        if config.method == "bc":
+            expert = self.sample_expert(rng, config.cloning.batch_size)
+        else:
+            windows = self.agent.rewarder.relabel is not None
+            sampled = self.replay.sample(rng, config.batch_size, windows=windows)
+            batch = Batch(*sampled)
+            if self.agent.rewarder.samples_expert:
+                expert = self.sample_expert(rng, config.discriminator.batch_size)
         self.state, self.metrics = self.agent.update_step(self.state, batch, expert)
+
+    def sample_expert(self, rng: np.random.Generator, batch_size: int) -> ExpertBatch:
+        """Draws from the demonstrations."""
+        assert self.demonstrations is not None
+        drawn = host_demonstrations.sample(
+            self.demonstrations,
+            rng,
+            batch_size,
+            frame_stack=experiment.stack_size(self.config),
+        )
+        return ExpertBatch(*drawn)
 
     def finish_episode(self) -> None:
         """Rewards a finished episode once, and stores it for good."""
@@ -221,13 +260,8 @@ class Run:
 
     def reward(self, episode: FinishedEpisode) -> np.ndarray:
         """Returns the rewarder's rewards [T]; its state moves on."""
-        device_episode = Episode(
-            episode.frames,
-            episode.actions,
-            episode.task_rewards,
-        )
         rewards, rewarder = self.agent.rewards(
-            self.state.rewarder, self.state.params, device_episode, self.experts
+            self.state.rewarder, self.state.params, _seen(episode), self.experts
         )
         self.state = self.state.replace(rewarder=rewarder)
         return np.asarray(rewards)
@@ -257,14 +291,47 @@ class Run:
             record_video=every > 0
             and (counters.num_evals % every == 0 or self.frame >= config.total_frames),
         )
+        distance = None
+        if self.closeness is not None:
+            distance = self.closeness.relative_distance(evaluation.episodes)
+        filmed = {}
+        if evaluation.video is not None:
+            filmed = self.explain(evaluation.episodes[0])
         counters.num_evals += 1
         counters.last_eval_step = counters.num_steps
         counters.seconds = time.monotonic() - self.started
         self.say(
             self.outputs.evaluation(
-                evaluation, self.frame, counters.seconds, counters.num_episodes
+                evaluation,
+                self.frame,
+                counters.seconds,
+                counters.num_episodes,
+                distance=distance,
+                filmed=filmed,
             )
         )
+
+    def explain(self, episode: FinishedEpisode) -> dict[str, np.ndarray]:
+        """Returns what the method thinks of an episode, for people to look at.
+
+        Returns:
+          `task_rewards` [T], `imitation_rewards` [T], and the transport plan
+          `plan` [T + 1, N + 1] of methods that have one.
+        """
+        arguments = (
+            self.state.rewarder,
+            self.state.params,
+            _seen(episode),
+            self.experts,
+        )
+        rewards, _ = self.agent.rewards(*arguments)
+        found = {
+            "task_rewards": episode.task_rewards,
+            "imitation_rewards": np.asarray(rewards),
+        }
+        if self.agent.plan is not None:
+            found["plan"] = np.asarray(self.agent.plan(*arguments))
+        return found
 
     def is_due(self, last_step: int, every_frames: int) -> bool:
         """Says whether that many frames have gone by, or the budget is used up.
@@ -306,6 +373,10 @@ class Run:
         self.counters = Counters(**counters)
         self.say(f"going on from the checkpoint of frame {self.frame}")
         return state
+
+
+def _seen(episode: FinishedEpisode) -> Episode:
+    return Episode(episode.frames, episode.actions, episode.task_rewards)
 
 
 def train(config: Config, workdir: pathlib.Path) -> bool:

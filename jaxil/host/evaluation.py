@@ -1,21 +1,22 @@
 """How good a policy is by the task's own reward."""
 
-import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxil.host.interaction import Act, interact
+from jaxil.host.interaction import Act, Decision, FinishedEpisode, interact, join
 
 
 class Evaluation(NamedTuple):
     """Episodes of one policy.
 
     Attributes:
+      episodes: what was seen and done in each.
       task_returns: undiscounted sums of the task's reward. Shape [E].
       video: images of the first episode, uint8 [T + 1, H, W, 3]; None if not asked.
     """
 
+    episodes: list[FinishedEpisode]
     task_returns: np.ndarray
     video: np.ndarray | None
 
@@ -47,23 +48,24 @@ def evaluate(
       first_episode: number of the first, which fixes how each one starts.
       record_video: whether to keep the first episode's images.
     """
+    episodes: list[FinishedEpisode] = []
     returns: list[float] = []
+    played: list[Decision] = []
     images: list[np.ndarray] = []
-    total = 0.0
-    decisions = interact(environment, act, first_episode=first_episode)
-    for number in itertools.count():
-        if number == 0 and record_video:
-            # The reset's own image, before the first decision replaces it.
-            environment.reset(episode=first_episode)
-            images.append(environment.frame())
-        decision = next(decisions)
-        total += decision.task_reward
-        if record_video and not returns:
+    if record_video:
+        # The reset's own image, before the first decision replaces it.
+        environment.reset(episode=first_episode)
+        images.append(environment.frame())
+    for decision in interact(environment, act, first_episode=first_episode):
+        played.append(decision)
+        if record_video and not episodes:
             images.append(environment.frame())
         if decision.is_last:
-            returns.append(total)
-            total = 0.0
-            if len(returns) == num_episodes:
+            episodes.append(join(played))
+            # In double precision, as rewards come, whatever an episode stores.
+            returns.append(sum(each.task_reward for each in played))
+            played = []
+            if len(episodes) == num_episodes:
                 break
     video = np.stack(images) if record_video else None
-    return Evaluation(np.asarray(returns), video)
+    return Evaluation(episodes, np.asarray(returns), video)

@@ -27,6 +27,7 @@ EVAL_COLUMNS = (
     "task_return_mean",
     "task_return_std",
     "expert_task_return_mean",
+    "wasserstein_to_expert",  # relative to a random policy's
 )
 
 

@@ -16,6 +16,14 @@ import numpy as np
 from jaxil.host.stacking import gather_stacks
 
 
+class Window(NamedTuple):
+    """All transitions of n-step windows, for methods that reward them anew."""
+
+    observation: np.ndarray  # [B, n, H, W, C * stack] uint8, or [B, n, S] float32
+    action: np.ndarray  # [B, n, A] float32
+    weight: np.ndarray  # [B, n] float32: what each reward is multiplied by in the sum
+
+
 class Batch(NamedTuple):
     """Transitions over n steps, as the learner gets them."""
 
@@ -24,6 +32,7 @@ class Batch(NamedTuple):
     reward: np.ndarray  # [B] float32: discounted sum of r_t ... r_{t+n-1}
     discount: np.ndarray  # [B] float32: what the value of o_{t+n} is multiplied by
     next_observation: np.ndarray  # like observation: o_{t+n}
+    window: Window | None  # None unless asked for
 
 
 class Episode(NamedTuple):
@@ -237,7 +246,9 @@ class Replay:
         """Says whether any stored episode is long enough for a window of n steps."""
         return self._num_starts > 0
 
-    def sample(self, rng: np.random.Generator, batch_size: int) -> Batch:
+    def sample(
+        self, rng: np.random.Generator, batch_size: int, *, windows: bool = False
+    ) -> Batch:
         """Draws transitions, uniformly with replacement from all windows of n steps.
 
         reward = sum_{k<n} gamma^k d_t ... d_{t+k-1} r_{t+k}, and
@@ -248,6 +259,7 @@ class Replay:
         Args:
           rng: source of the draw; it is advanced by one call.
           batch_size: B >= 1.
+          windows: whether to add each window's own transitions.
 
         Returns:
           A batch of fresh arrays in C order.
@@ -272,17 +284,29 @@ class Replay:
         discounts = self._discount_factor * self._discounts[slots].astype(np.float64)
         discounts = np.cumprod(discounts, axis=1)
         # A reward is discounted by what lies before it, not by its own step's discount.
-        rewards[:, 1:] *= discounts[:, :-1]
+        weights = np.concatenate([np.ones((batch_size, 1)), discounts[:, :-1]], axis=1)
 
         # Both ends of the windows in one go: the work is shared out among threads.
-        ends = np.concatenate([steps, steps + self._window])
-        observations = self._observations(np.tile(starts, 2), ends)
+        # Where all of a window is asked for, its inside comes first of all.
+        ages = np.arange(self._window + 1) if windows else np.array([0, self._window])
+        times = (steps + ages[:, None]).ravel()
+        observations = self._observations(np.tile(starts, len(ages)), times)
+        observations = observations.reshape(
+            len(ages), batch_size, *observations.shape[1:]
+        )
         return Batch(
-            observation=observations[:batch_size],
+            observation=observations[0],
             action=self._actions[slots[:, 0]],
-            reward=rewards.sum(axis=1).astype(np.float32),
+            reward=(weights * rewards).sum(axis=1).astype(np.float32),
             discount=discounts[:, -1].astype(np.float32),
-            next_observation=observations[batch_size:],
+            next_observation=observations[-1],
+            window=Window(
+                observation=np.ascontiguousarray(observations[:-1].swapaxes(0, 1)),
+                action=self._actions[slots],
+                weight=weights.astype(np.float32),
+            )
+            if windows
+            else None,
         )
 
     def check_valid(self) -> tuple[bool, str]:

@@ -94,7 +94,8 @@ def init_train_state(
 def make_update_step(learner: Learner) -> UpdateStep:
     """Returns the learning step, to be jitted with its state donated.
 
-    The order is that of the reference: augment; rewarder on pre-update features;
+    The order is that of the reference: rewards, where they are not stored; augment;
+    rewarder on pre-update features;
     critic, which alone trains the encoder; actor with the updated critic on the
     pre-update representation; target critic last.
     """
@@ -110,6 +111,13 @@ def make_update_step(learner: Learner) -> UpdateStep:
         )
         std = jnp.asarray(learner.exploration_std(state.num_updates), jnp.float32)
         before = state.params
+        unshifted = batch.observation
+        if learner.rewarder.relabel is not None:
+            assert batch.window is not None
+            rewards = learner.rewarder.relabel(state.rewarder, before, batch.window)
+            chex.assert_equal_shape([rewards, batch.window.weight])
+            reward = jnp.sum(batch.window.weight * rewards, axis=1)
+            batch = batch._replace(reward=jax.lax.stop_gradient(reward))
         batch = batch._replace(
             observation=_augment(learner, batch.observation, shift_key),
             next_observation=_augment(learner, batch.next_observation, next_key),
@@ -123,7 +131,7 @@ def make_update_step(learner: Learner) -> UpdateStep:
         )
         # The rewarder's step is written last but reads only values from before
         # this update, as if it came first; so the features are computed once.
-        agent = AgentView(batch.observation, features, batch.action)
+        agent = AgentView(batch.observation, features, batch.action, unshifted)
         rewarder, rewarder_metrics = learner.rewarder.update(
             state.rewarder, before, agent, expert, rewarder_key
         )
@@ -145,9 +153,7 @@ def make_update_step(learner: Learner) -> UpdateStep:
 
 
 def _augment(learner: Learner, observation: Array, key: Array) -> Array:
-    if observation.ndim == 2:  # state vectors have nothing to shift
-        return observation
-    return augmentation.random_shift(observation, key, padding=learner.shift_padding)
+    return augmentation.augment(observation, key, padding=learner.shift_padding)
 
 
 def _update_critic(

@@ -30,6 +30,14 @@ def stack_frames(frames: Array, *, frame_stack: int) -> Array:
     return jnp.concatenate(past, axis=-1)
 
 
+def augment(observation: Array, key: Array, *, padding: int) -> Array:
+    """Shifts pixels [B, H, W, C], see `random_shift`; leaves states [B, S] alone."""
+    chex.assert_rank(observation, {2, 4})
+    if observation.ndim == 2:
+        return observation
+    return random_shift(observation, key, padding=padding)
+
+
 def random_shift(images: Array, key: Array, *, padding: int) -> Array:
     """Shifts each image by whole pixels, repeating the border.
 

@@ -1,6 +1,7 @@
 """Losses and targets on arrays."""
 
 from collections.abc import Callable
+from typing import Any
 
 import chex
 import jax
@@ -98,17 +99,20 @@ def discriminator_loss(expert_logits: Array, agent_logits: Array) -> Array:
 
 
 def gradient_penalty(
-    logits: Callable[[Array], Array], expert: Array, agent: Array, key: Array
+    logits: Callable[[Any], Array], expert: Any, agent: Any, key: Array
 ) -> Array:
     """Returns the mean squared distance of the input gradient's norm from one.
 
         x_i = u_i e_i + (1 - u_i) a_i,   u_i ~ Uniform(0, 1)
         L   = mean_i (|d l(x_i) / d x_i| - 1)^2
 
+    Inputs of several arrays (pixels and an action) count as one long vector.
+
     Args:
-      logits: discriminator of a batch, [B, D] -> [B], each row by itself.
-      expert: discriminator inputs of demonstrations. Shape [B, D].
-      agent: discriminator inputs of the agent. Shape [B, D].
+      logits: discriminator of a batch, inputs -> [B], each row by itself.
+      expert: discriminator inputs of demonstrations: a pytree of float arrays, each
+        of shape [B, ...].
+      agent: the same of the agent.
       key: consumed.
 
     Returns:
@@ -116,11 +120,38 @@ def gradient_penalty(
 
     Source: Gulrajani et al. 2017, arXiv:1704.00028, eq. (3).
     """
-    chex.assert_rank([expert, agent], 2)
-    chex.assert_equal_shape([expert, agent])
-    mix = jax.random.uniform(key, (expert.shape[0], 1), expert.dtype)
-    between = mix * expert + (1.0 - mix) * agent
+    chex.assert_trees_all_equal_shapes_and_dtypes(expert, agent)
+    leaves = jax.tree.leaves(expert)
+    chex.assert_equal_shape_prefix(leaves, 1)
+    mix = jax.random.uniform(key, leaves[0].shape[:1], leaves[0].dtype)
+
+    def blend(e: Array, a: Array) -> Array:
+        share = mix.reshape(-1, *[1] * (e.ndim - 1))
+        return share * e + (1.0 - share) * a
+
+    between = jax.tree.map(blend, expert, agent)
     # Rows do not see each other, so the gradient of the sum holds every row's own.
     gradients = jax.grad(lambda x: jnp.sum(logits(x)))(between)
-    norms = jnp.sqrt(jnp.sum(jnp.square(gradients), axis=1) + _NORM_FLOOR)
+    squares = [
+        jnp.sum(jnp.square(g), axis=tuple(range(1, g.ndim)))
+        for g in jax.tree.leaves(gradients)
+    ]
+    norms = jnp.sqrt(sum(squares) + _NORM_FLOOR)
     return jnp.mean(jnp.square(norms - 1.0))
+
+
+def cloning_loss(mean: Array, action: Array, *, std: float) -> Array:
+    """Returns minus the log-probability of the expert's actions.
+
+        L = mean_b sum_a (x - m)^2 / (2 s^2) + log s + log(2 pi) / 2
+
+    Args:
+      mean: m, the policy's means. Shape [B, A], in [-1, 1].
+      action: x, what the expert did. Shape [B, A].
+      std: s, of the policy; fixed.
+
+    Source: siddhanthaldar/ROT, agent/bc.py; the paper gives neither loss nor s.
+    """
+    chex.assert_rank([mean, action], 2)
+    chex.assert_equal_shape([mean, action])
+    return -jnp.mean(jnp.sum(jax.scipy.stats.norm.logpdf(action, mean, std), axis=1))

@@ -33,6 +33,50 @@ def cosine_cost(x: Array, y: Array) -> Array:
     return jnp.clip(1.0 - cosine, 0.0, 2.0)
 
 
+def euclidean_cost(x: Array, y: Array) -> Array:
+    """Returns pairwise Euclidean distances.
+
+        C_ij = |x_i - y_j|
+
+    Args:
+      x: agent features. Shape [T, D].
+      y: expert features. Shape [N, D].
+
+    Returns:
+      Costs. Shape [T, N].
+
+    Source: Cohen et al. 2021, fig. 7.
+    """
+    chex.assert_rank([x, y], 2)
+    chex.assert_equal_shape_suffix([x, y], 1)
+    product = jnp.matmul(x, y.T, precision=lax.Precision.HIGHEST)
+    squares = jnp.sum(x**2, 1)[:, None] + jnp.sum(y**2, 1)[None] - 2.0 * product
+    # The floor also keeps the root's gradient finite where two features are equal.
+    return jnp.sqrt(jnp.maximum(squares, _NORM_FLOOR))
+
+
+def simultaneous_plan(cost: Array, expert_mass: Array) -> Array:
+    """Returns the plan that pairs moment t with moment t: no transport at all.
+
+        P_tn = 1/T  for  n = min(t, number of the expert's moments - 1),  else 0
+
+    Args:
+      cost: read for its shape. Shape [T, N].
+      expert_mass: zero beyond the expert's own moments. Shape [N].
+
+    Returns:
+      Shape [T, N].
+
+    Source: Cohen et al. 2021, fig. 7.
+    """
+    chex.assert_rank([cost, expert_mass], [2, 1])
+    chex.assert_equal_shape_suffix([cost, expert_mass], 1)
+    num_steps, length = cost.shape
+    last = jnp.sum(expert_mass > 0.0) - 1
+    partners = jnp.minimum(jnp.arange(num_steps), last)
+    return jax.nn.one_hot(partners, length, dtype=cost.dtype) / num_steps
+
+
 def sinkhorn_plan(
     cost: Array, expert_mass: Array, *, epsilon: float, num_iterations: int
 ) -> Array:

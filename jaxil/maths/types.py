@@ -14,6 +14,21 @@ Data = Any  # an array: NumPy's on the host, jax's inside jitted functions
 Metrics = dict[str, Array]  # scalars, left on the device until they are logged
 
 
+class Window(NamedTuple):
+    """Every transition of n-step windows, for methods that reward them anew.
+
+    Attributes:
+      observation: uint8 [B, n, H, W, C], or float32 [B, n, S].
+      action: shape [B, n, A].
+      weight: what each one's reward counts for in the window's: gamma^k times the
+        environment's discounts before it. Shape [B, n].
+    """
+
+    observation: Data
+    action: Data
+    weight: Data
+
+
 class Batch(NamedTuple):
     """Sampled transitions, n environment decisions long.
 
@@ -23,6 +38,8 @@ class Batch(NamedTuple):
       reward: discounted sum of the window's rewards. Shape [B].
       discount: product of environment discounts and gamma^n. Shape [B].
       next_observation: observation after the window, like `observation`.
+      window: all of the window's transitions; None for methods whose rewards are
+        stored.
     """
 
     observation: Data
@@ -30,6 +47,7 @@ class Batch(NamedTuple):
     reward: Data
     discount: Data
     next_observation: Data
+    window: Window | None = None
 
 
 class ExpertBatch(NamedTuple):

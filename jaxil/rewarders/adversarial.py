@@ -6,16 +6,12 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from jaxil.learner.state import (
-    LearnerParams,
-    ModuleState,
-    apply_gradients,
-    init_module,
-)
-from jaxil.maths import augmentation, losses
+from jaxil.learner.state import LearnerParams, ModuleState, init_module
+from jaxil.maths import augmentation
 from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes, Metrics, Params
 from jaxil.networks.agent import AgentNetworks, apply, critic_features
 from jaxil.networks.discriminator import Discriminator
+from jaxil.rewarders.discrimination import update_discriminator
 from jaxil.rewarders.rewarder import AgentView, Rewarder, Spec
 
 
@@ -32,11 +28,11 @@ def make_adversarial_rewarder(
 ) -> Rewarder:
     """Returns the rewarder of P-DAC.
 
-        max_D  mean log D(e) + mean log(1 - D(a)) - penalty_weight * GP,    r = logit
+        r = logit D(e)
 
-    where e and a are critic-trunk features of augmented observations, without
-    gradient into encoder or trunk. log D - log(1 - D), the paper's reward, is the
-    logit itself, and only the logit stays finite in float32.
+    where D, see `update_discriminator`, judges critic-trunk features e of augmented
+    observations, without gradient into encoder or trunk. log D - log(1 - D), the
+    paper's reward, is the logit itself, and only the logit stays finite in float32.
 
     Args:
       networks: of the agent; only the encoder and the critic's trunk are used.
@@ -78,35 +74,21 @@ def make_adversarial_rewarder(
         assert expert is not None
         chex.assert_axis_dimension(expert.observation, 0, batch_size)
         shift_key, penalty_key = jax.random.split(key)
-        observation = expert.observation
-        if observation.ndim == 4:
-            observation = augmentation.random_shift(
-                observation, shift_key, padding=shift_padding
-            )
+        observation = augmentation.augment(
+            expert.observation, shift_key, padding=shift_padding
+        )
         features = critic_features(
             networks, learner.encoder, learner.critic, observation
         )
-        expert_inputs = jax.lax.stop_gradient(inputs(features, expert.action))
-        agent_inputs = inputs(agent.features[:batch_size], agent.action[:batch_size])
-        agent_inputs = jax.lax.stop_gradient(agent_inputs)
-
-        def loss(params: Params) -> tuple[Array, Metrics]:
-            both = logits(params, jnp.concatenate([expert_inputs, agent_inputs]))
-            expert_logits, agent_logits = both[:batch_size], both[batch_size:]
-            cross_entropy = losses.discriminator_loss(expert_logits, agent_logits)
-            penalty = losses.gradient_penalty(
-                lambda x: logits(params, x), expert_inputs, agent_inputs, penalty_key
-            )
-            metrics = {
-                "discriminator/loss": cross_entropy,
-                "discriminator/penalty": penalty,
-                "discriminator/expert_logit": jnp.mean(expert_logits),
-                "discriminator/agent_logit": jnp.mean(agent_logits),
-            }
-            return cross_entropy + penalty_weight * penalty, metrics
-
-        gradients, metrics = jax.grad(loss, has_aux=True)(state.params)
-        return apply_gradients(state, gradients, optimiser), metrics
+        return update_discriminator(
+            state,
+            logits,
+            inputs(features, expert.action),
+            inputs(agent.features[:batch_size], agent.action[:batch_size]),
+            penalty_key,
+            penalty_weight=penalty_weight,
+            optimiser=optimiser,
+        )
 
     def rewards(
         state: ModuleState,

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from jax import Array
 
 from jaxil.learner.state import LearnerParams
-from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes, Metrics
+from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes, Metrics, Window
 
 RewarderState = Any  # a pytree, the method's own
 
@@ -18,11 +18,13 @@ class AgentView(NamedTuple):
       observation: augmented pixels. Shape [B, H, W, C].
       features: critic trunk features of them, without gradient. Shape [B, D].
       action: shape [B, A].
+      unshifted: the pixels as they were stored. Shape [B, H, W, C].
     """
 
     observation: Array
     features: Array
     action: Array
+    unshifted: Array
 
 
 class Spec(NamedTuple):
@@ -33,12 +35,14 @@ class Spec(NamedTuple):
       feature_dim: D.
       num_demonstrations: K; 0 without demonstrations.
       expert_steps: N, decisions in a demonstration.
+      observation_shape: (H, W, C), or (S,).
     """
 
     action_dim: int
     feature_dim: int
     num_demonstrations: int
     expert_steps: int
+    observation_shape: tuple[int, ...]
 
 
 class Rewarder(NamedTuple):
@@ -58,6 +62,10 @@ class Rewarder(NamedTuple):
       matches_episodes: whether `rewards` reads whole demonstrations; without,
         `expert_episodes` is None.
       summary: state -> scalars worth logging after an episode.
+      relabel: (state, learner, window) -> rewards [B, n]. For methods that reward
+        sampled transitions anew at each update; None where rewards are stored.
+      plan: (state, learner, episode, expert_episodes) -> the transport plan
+        [T + 1, N + 1] behind `rewards`, for people to look at; None without one.
     """
 
     init: Callable[[Array, Spec, LearnerParams], RewarderState]
@@ -72,6 +80,10 @@ class Rewarder(NamedTuple):
     samples_expert: bool
     matches_episodes: bool
     summary: Callable[[RewarderState], Metrics] = lambda state: {}
+    relabel: Callable[[RewarderState, LearnerParams, Window], Array] | None = None
+    plan: (
+        Callable[[RewarderState, LearnerParams, Episode, ExpertEpisodes], Array] | None
+    ) = None
 
 
 def keep_state(

@@ -7,9 +7,10 @@ from flax import struct
 from jax import Array
 
 from jaxil.learner.state import LearnerParams, copy_params
-from jaxil.maths import augmentation, transport
+from jaxil.maths import augmentation
 from jaxil.maths.types import Episode, ExpertEpisodes, Params
 from jaxil.networks.agent import AgentNetworks, actor_features
+from jaxil.rewarders.matching import Matching
 from jaxil.rewarders.rewarder import Rewarder, Spec, keep_state
 
 _COST_FLOOR = 1e-8  # keeps the scale finite if the first episode costs nothing
@@ -36,8 +37,7 @@ class SinkhornState(struct.PyTreeNode):
 def make_sinkhorn_rewarder(
     networks: AgentNetworks,
     *,
-    epsilon: float,
-    num_iterations: int,
+    matching: Matching,
     target_update_steps: int,
     return_scale: float,
     frame_stack: int,
@@ -56,8 +56,7 @@ def make_sinkhorn_rewarder(
 
     Args:
       networks: of the agent; only the encoder and the actor's trunk are used.
-      epsilon: weight of the entropy, in units of cost.
-      num_iterations: of Sinkhorn.
+      matching: cost and plan; see `make_matching`.
       target_update_steps: agent steps between copies; 10000 in the paper.
       return_scale: 10 in the paper.
       frame_stack: frames in an observation.
@@ -105,9 +104,6 @@ def make_sinkhorn_rewarder(
         expert_episodes: ExpertEpisodes | None,
     ) -> tuple[Array, SinkhornState]:
         assert expert_episodes is not None
-        chex.assert_equal_shape_prefix(
-            [expert_episodes.frames, expert_episodes.num_frames], 1
-        )
         num_steps = jnp.asarray(episode.actions.shape[0], jnp.int32)
         state = state.replace(steps_since_copy=state.steps_since_copy + num_steps)
         state = jax.lax.cond(
@@ -117,18 +113,23 @@ def make_sinkhorn_rewarder(
             state,
         )
         features = embed(state.target_encoder, state.target_actor, episode.frames)
-        costs = jax.vmap(transport.cosine_cost, in_axes=(None, 0))(
-            features, state.expert_features
-        )
-        masses = jax.vmap(transport.uniform_mass, in_axes=(0, None))(
-            expert_episodes.num_frames, costs.shape[2]
-        )
-        unscaled = closest_rewards(
-            costs, masses, epsilon=epsilon, num_iterations=num_iterations
+        unscaled = matching.rewards(
+            features, state.expert_features, expert_episodes.num_frames
         )[1:]
-        first_scale = return_scale / jnp.maximum(-jnp.sum(unscaled), _COST_FLOOR)
-        scale = jnp.where(state.scale > 0.0, state.scale, first_scale)
+        scale = scale_of_first_episode(state.scale, unscaled, return_scale)
         return scale * unscaled, state.replace(scale=scale)
+
+    def plan(
+        state: SinkhornState,
+        learner: LearnerParams,
+        episode: Episode,
+        expert_episodes: ExpertEpisodes,
+    ) -> Array:
+        del learner
+        features = embed(state.target_encoder, state.target_actor, episode.frames)
+        return matching.closest_plan(
+            features, state.expert_features, expert_episodes.num_frames
+        )
 
     return Rewarder(
         init,
@@ -137,37 +138,18 @@ def make_sinkhorn_rewarder(
         samples_expert=False,
         matches_episodes=True,
         summary=lambda state: {"sinkhorn/scale": state.scale},
+        plan=plan,
     )
 
 
-def closest_rewards(
-    costs: Array, expert_masses: Array, *, epsilon: float, num_iterations: int
-) -> Array:
-    """Returns transport rewards to the demonstration that is cheapest to reach.
-
-        k* = argmin_k <C_k, P_k>,    r_t = - sum_n C_k*tn P_k*tn
-
-    The paper compares entropic distances; the reference compares transport costs
-    without their entropy, as here. At epsilon 0.01 they rank alike.
+def scale_of_first_episode(scale: Array, unscaled: Array, return_scale: float) -> Array:
+    """Returns the factor that gives the first episode the return `-return_scale`.
 
     Args:
-      costs: one matrix for each demonstration. Shape [K, T, N].
-      expert_masses: what each of its moments carries. Shape [K, N].
-      epsilon: weight of the entropy, in units of cost.
-      num_iterations: of Sinkhorn.
-
-    Returns:
-      Rewards of the agent's T observations. Shape [T].
-
-    Source: Cohen et al. 2021, eq. (5); siddhanthaldar/ROT, agent/potil.py.
+      scale: the one that is in force; 0 before the first episode. Shape [].
+      unscaled: rewards of an episode. Shape [T].
+      return_scale: 10 in the paper.
     """
-    chex.assert_rank([costs, expert_masses], [3, 2])
-
-    def solve(cost: Array, expert_mass: Array) -> Array:
-        plan = transport.sinkhorn_plan(
-            cost, expert_mass, epsilon=epsilon, num_iterations=num_iterations
-        )
-        return transport.transport_rewards(cost, plan)
-
-    candidates = jax.vmap(solve)(costs, expert_masses)
-    return candidates[jnp.argmax(jnp.sum(candidates, axis=1))]
+    chex.assert_rank([scale, unscaled], [0, 1])
+    first = return_scale / jnp.maximum(-jnp.sum(unscaled), _COST_FLOOR)
+    return jnp.where(scale > 0.0, scale, first)

@@ -17,7 +17,7 @@ from jaxil.networks.agent import make_agent_networks
 from jaxil.rewarders.rewarder import Spec
 from jaxil.rewarders.task import make_task_rewarder
 
-SPEC = Spec(action_dim=2, feature_dim=5, num_demonstrations=0, expert_steps=0)
+SPEC = Spec(2, 5, num_demonstrations=0, expert_steps=0, observation_shape=(12, 12, 6))
 
 
 def tiny_learner():

@@ -14,13 +14,20 @@ from jaxil.learner.update import Learner, init_train_state, make_update_step
 from jaxil.maths.types import Batch, Episode, ExpertBatch, ExpertEpisodes
 from jaxil.networks.agent import apply, critic_features, make_agent_networks
 from jaxil.rewarders.adversarial import make_adversarial_rewarder
+from jaxil.rewarders.matching import make_matching
 from jaxil.rewarders.rewarder import Rewarder, Spec
 from jaxil.rewarders.sinkhorn import make_sinkhorn_rewarder
 from jaxil.rewarders.task import make_task_rewarder
 
 SIDE, CHANNELS, ACTIONS, BATCH, PADDING = 12, 6, 2, 8, 2
 TAU, NOISE_CLIP, LEARNING_RATE = 0.05, 0.3, 3e-3
-SPEC = Spec(action_dim=ACTIONS, feature_dim=5, num_demonstrations=2, expert_steps=3)
+SPEC = Spec(
+    action_dim=ACTIONS,
+    feature_dim=5,
+    num_demonstrations=2,
+    expert_steps=3,
+    observation_shape=(SIDE, SIDE, CHANNELS),
+)
 SCHEDULE = optax.linear_schedule(1.0, 0.0, 10)
 NETWORKS = make_agent_networks(
     action_dim=ACTIONS,
@@ -49,8 +56,9 @@ PDAC = make_adversarial_rewarder(
 )
 PSIL = make_sinkhorn_rewarder(
     NETWORKS,
-    epsilon=0.01,
-    num_iterations=20,
+    matching=make_matching(
+        cost="cosine", alignment="transport", epsilon=0.01, num_iterations=20
+    ),
     target_update_steps=10,
     return_scale=10.0,
     frame_stack=2,

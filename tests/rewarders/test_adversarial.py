@@ -28,7 +28,7 @@ NETWORKS = make_agent_networks(
     contrast=1.0,
     mean=0.5,
 )
-SPEC = Spec(action_dim=2, feature_dim=5, num_demonstrations=2, expert_steps=4)
+SPEC = Spec(2, 5, 2, expert_steps=4, observation_shape=(SIDE, SIDE, 3))
 
 
 @functools.cache
@@ -74,7 +74,8 @@ def make_view(params, frames, actions=None):
         NETWORKS, params.encoder, params.critic, jnp.asarray(frames)
     )
     actions = random_actions(9, len(frames)) if actions is None else actions
-    return AgentView(jnp.asarray(frames), features, jnp.asarray(actions))
+    frames = jnp.asarray(frames)
+    return AgentView(frames, features, jnp.asarray(actions), frames)
 
 
 def rewards_of(rewarder, params, frames, actions=None, seed=0):

@@ -13,8 +13,9 @@ from jaxil.learner.state import LearnerParams
 from jaxil.maths import augmentation, transport
 from jaxil.maths.types import Episode, ExpertEpisodes
 from jaxil.networks.agent import actor_features, apply, make_agent_networks
+from jaxil.rewarders.matching import closest_rewards, make_matching
 from jaxil.rewarders.rewarder import Spec
-from jaxil.rewarders.sinkhorn import closest_rewards, make_sinkhorn_rewarder
+from jaxil.rewarders.sinkhorn import make_sinkhorn_rewarder
 
 SIDE, STEPS, EXPERT_STEPS, K = 12, 6, 5, 3
 NETWORKS = make_agent_networks(
@@ -29,7 +30,11 @@ NETWORKS = make_agent_networks(
     mean=0.5,
 )
 SPEC = Spec(
-    action_dim=2, feature_dim=5, num_demonstrations=K, expert_steps=EXPERT_STEPS
+    action_dim=2,
+    feature_dim=5,
+    num_demonstrations=K,
+    expert_steps=EXPERT_STEPS,
+    observation_shape=(SIDE, SIDE, 3),
 )
 
 
@@ -37,8 +42,9 @@ SPEC = Spec(
 def make_rewarder(frame_stack=1, target_update_steps=20):
     rewarder = make_sinkhorn_rewarder(
         NETWORKS,
-        epsilon=0.01,
-        num_iterations=50,
+        matching=make_matching(
+            cost="cosine", alignment="transport", epsilon=0.01, num_iterations=50
+        ),
         target_update_steps=target_update_steps,
         return_scale=10.0,
         frame_stack=frame_stack,
@@ -79,9 +85,13 @@ def make_experts(seed=50):
 def solve(costs, *, epsilon, num_iterations):
     """Rewards to demonstrations of one length."""
     masses = jnp.full((costs.shape[0], costs.shape[2]), 1.0 / costs.shape[2])
-    return closest_rewards(
-        costs, masses, epsilon=epsilon, num_iterations=num_iterations
+    matching = make_matching(
+        cost="cosine",
+        alignment="transport",
+        epsilon=epsilon,
+        num_iterations=num_iterations,
     )
+    return closest_rewards(costs, jax.vmap(matching.plan)(costs, masses))
 
 
 def start(rewarder, params):

@@ -11,7 +11,7 @@ from jaxil.rewarders.rewarder import AgentView, Spec
 from jaxil.rewarders.task import make_task_rewarder, make_zero_rewarder
 
 NOTHING = LearnerParams({}, {}, {})
-SPEC = Spec(action_dim=1, feature_dim=2, num_demonstrations=0, expert_steps=0)
+SPEC = Spec(1, 2, num_demonstrations=0, expert_steps=0, observation_shape=(5,))
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,7 @@ def test_rewards_need_no_demonstrations(rewarder, expected):
     rewards, after = rewarder.rewards(state, NOTHING, episode, None)
     np.testing.assert_array_equal(rewards, expected)
     assert after == state
-    view = AgentView(jnp.zeros((2, 5)), jnp.zeros((2, 2)), jnp.zeros((2, 1)))
+    view = AgentView(*(jnp.zeros((2, n)) for n in (5, 2, 1, 5)))
     assert rewarder.update(state, NOTHING, view, None, jax.random.key(0)) == (state, {})
     assert not rewarder.samples_expert
     assert not rewarder.matches_episodes

@@ -1,0 +1,97 @@
+"""Behavioural cloning: its loss, what it moves, and that it copies."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from scipy import stats
+
+from jaxil.learner.cloning import make_cloning_step
+from jaxil.learner.policy import make_exploit
+from jaxil.learner.update import Learner, init_train_state
+from jaxil.maths import losses
+from jaxil.maths.types import ExpertBatch
+from jaxil.networks.agent import make_agent_networks
+from jaxil.rewarders.rewarder import Spec
+from jaxil.rewarders.task import make_zero_rewarder
+
+SHAPE = (12, 12, 3)
+NETWORKS = make_agent_networks(
+    action_dim=2,
+    feature_dim=8,
+    hidden_dim=32,
+    observation="pixels",
+    channels=(8,),
+    kernel_sizes=(4,),
+    strides=(4,),
+    contrast=1.0,
+    mean=0.5,
+)
+
+
+def make_learner(shift_padding=0):
+    return Learner(
+        networks=NETWORKS,
+        rewarder=make_zero_rewarder(),
+        learning_rate=3e-3,
+        critic_target_tau=0.01,
+        noise_clip=0.3,
+        shift_padding=shift_padding,
+        pre_tanh_penalty=0.0,
+        exploration_std=optax.constant_schedule(0.1),
+    )
+
+
+def make_state(learner):
+    spec = Spec(2, 8, num_demonstrations=1, expert_steps=4, observation_shape=SHAPE)
+    return init_train_state(learner, jax.random.key(0), np.zeros(SHAPE, np.uint8), spec)
+
+
+def make_expert(seed=0, size=16):
+    rng = np.random.default_rng(seed)
+    return ExpertBatch(
+        rng.integers(0, 256, (size, *SHAPE), dtype=np.uint8),
+        rng.uniform(-0.9, 0.9, (size, 2)).astype(np.float32),
+    )
+
+
+def test_the_loss_is_scipys_log_probability():
+    rng = np.random.default_rng(0)
+    mean, action = rng.uniform(-1, 1, (2, 6, 3)).astype(np.float32)
+    expected = -stats.norm.logpdf(action, mean, 0.1).sum(axis=1).mean()
+    loss = losses.cloning_loss(mean, action, std=0.1)
+    np.testing.assert_allclose(loss, expected, rtol=1e-5)
+
+
+def test_copies_what_it_is_shown_and_moves_nothing_else():
+    learner, expert = make_learner(), make_expert()
+    before = make_state(learner)
+    step = jax.jit(make_cloning_step(learner, std=0.1))
+    state, first = step(before, None, expert)
+    for _ in range(400):
+        state, metrics = step(state, None, expert)
+    assert int(state.num_updates) == 401
+    assert metrics["actor/loss"] < first["actor/loss"]
+    exploit = jax.vmap(make_exploit(NETWORKS), in_axes=(None, None, 0))
+    copied = exploit(state.encoder.params, state.actor.params, expert.observation)
+    np.testing.assert_allclose(copied, expert.action, atol=0.1)
+    for name in ("critic", "target_critic", "rewarder"):
+        jax.tree.map(
+            np.testing.assert_array_equal, getattr(state, name), getattr(before, name)
+        )
+
+
+def test_augmentation_is_drawn_anew_each_time():
+    expert = make_expert()
+    for padding, expected in ((0, True), (2, False)):
+        step = jax.jit(make_cloning_step(make_learner(padding), std=0.1))
+        state = make_state(make_learner(padding))
+        losses_seen = [
+            float(
+                step(state.replace(num_updates=jnp.int32(n)), None, expert)[1][
+                    "actor/loss"
+                ]
+            )
+            for n in range(2)
+        ]
+        assert (losses_seen[0] == losses_seen[1]) is expected

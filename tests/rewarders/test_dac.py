@@ -1,0 +1,138 @@
+"""DAC on pixels: sign, alignment, rewards made anew, and eyes of its own."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxil.learner.state import LearnerParams
+from jaxil.maths.types import Episode, ExpertBatch, Window
+from jaxil.networks.agent import make_agent_networks
+from jaxil.rewarders.dac import make_dac_rewarder
+from jaxil.rewarders.rewarder import AgentView, Spec
+
+SIDE, STACK, BATCH = 12, 2, 8
+SHAPE = (SIDE, SIDE, 3 * STACK)
+SPEC = Spec(2, 5, num_demonstrations=2, expert_steps=4, observation_shape=SHAPE)
+NETWORKS = make_agent_networks(
+    action_dim=2,
+    feature_dim=5,
+    hidden_dim=6,
+    observation="pixels",
+    channels=(4,),
+    kernel_sizes=(4,),
+    strides=(4,),
+    contrast=1.0,
+    mean=0.5,
+)
+NOBODY = LearnerParams(None, None, None)  # the discriminator shares nothing
+
+
+@functools.cache
+def make_rewarder():
+    rewarder = make_dac_rewarder(
+        NETWORKS,
+        feature_dim=5,
+        hidden_dim=16,
+        learning_rate=3e-3,
+        penalty_weight=1.0,
+        batch_size=BATCH,
+        frame_stack=STACK,
+    )
+    return rewarder._replace(update=jax.jit(rewarder.update))
+
+
+def draw(seed, count, low=0, high=256, shape=SHAPE):
+    rng = np.random.default_rng(seed)
+    pixels = rng.integers(low, high, (count, *shape), dtype=np.uint8)
+    return pixels, rng.uniform(-1, 1, (count, 2)).astype(np.float32)
+
+
+def view(observation, action):
+    # What is shifted or belongs to the agent's networks must not matter.
+    poison = jnp.full(observation.shape, jnp.nan)
+    return AgentView(poison, jnp.full((len(action), 5), jnp.nan), action, observation)
+
+
+def learn(expert, agent, steps=200):
+    rewarder = make_rewarder()
+    state = rewarder.init(jax.random.key(0), SPEC, NOBODY)
+    rng = np.random.default_rng(0)
+    metrics = {}
+    for number in range(steps):
+        ours, theirs = rng.integers(0, len(agent[0]), (2, BATCH))
+        state, metrics = rewarder.update(
+            state,
+            NOBODY,
+            view(*(x[ours] for x in agent)),
+            ExpertBatch(*(x[theirs] for x in expert)),
+            jax.random.fold_in(jax.random.key(1), number),
+        )
+    return state, metrics
+
+
+@pytest.mark.parametrize("told_by", ["pixels", "actions"])
+def test_expert_above_zero_above_agent_after_learning(told_by):
+    expert, agent = draw(0, 64, 0, 100), draw(1, 64, 156, 256)
+    if told_by == "actions":
+        expert = (agent[0], np.full((64, 2), 0.9, np.float32))
+        agent = (agent[0], np.full((64, 2), -0.9, np.float32))
+    state, metrics = learn(expert, agent)
+    assert (
+        metrics["discriminator/expert_logit"] > 0 > metrics["discriminator/agent_logit"]
+    )
+    relabelled = [
+        make_rewarder().relabel(state, NOBODY, Window(o[:, None], a[:, None], None))
+        for o, a in (expert, agent)
+    ]
+    assert np.mean(relabelled[0]) > 0.1
+    assert np.mean(relabelled[1]) < -0.1
+
+
+def test_reward_t_judges_observation_and_action_t():
+    rewarder = make_rewarder()
+    state = rewarder.init(jax.random.key(0), SPEC, NOBODY)
+    frames, actions = draw(2, 6, shape=(SIDE, SIDE, 3))
+    before, _ = rewarder.rewards(
+        state, NOBODY, Episode(frames, actions[:5], np.zeros(5)), None
+    )
+    assert before.shape == (5,)
+    for t in range(5):
+        changed = actions[:5].copy()
+        changed[t] = -changed[t]
+        after, _ = rewarder.rewards(
+            state, NOBODY, Episode(frames, changed, np.zeros(5)), None
+        )
+        assert np.flatnonzero(np.asarray(after != before)).tolist() == [t]
+    other = frames.copy()
+    other[5] = 255 - other[5]  # what the last action led to
+    after, _ = rewarder.rewards(
+        state, NOBODY, Episode(other, actions[:5], np.zeros(5)), None
+    )
+    np.testing.assert_array_equal(after, before)
+
+
+def test_a_window_is_rewarded_as_its_transitions_are():
+    rewarder = make_rewarder()
+    state = rewarder.init(jax.random.key(0), SPEC, NOBODY)
+    pixels, actions = draw(3, 6)
+    window = Window(
+        pixels.reshape(2, 3, *SHAPE), actions.reshape(2, 3, 2), np.ones((2, 3))
+    )
+    together = rewarder.relabel(state, NOBODY, window)
+    single = rewarder.relabel(
+        state, NOBODY, Window(pixels[:, None], actions[:, None], None)
+    )
+    assert together.shape == (2, 3)
+    np.testing.assert_allclose(together.reshape(-1, 1), single, rtol=1e-4, atol=1e-5)
+
+
+def test_the_penalty_is_on_pixels_in_zero_to_one_and_actions():
+    # A step on batches that are one and the same leaves nothing but the penalty, and
+    # lowers it.
+    same = draw(4, BATCH)
+    _, first = learn((same[0], same[1]), same, steps=1)
+    _, last = learn((same[0], same[1]), same, steps=60)
+    assert last["discriminator/penalty"] < 0.5 * first["discriminator/penalty"]

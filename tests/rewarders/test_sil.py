@@ -1,0 +1,152 @@
+"""SIL on pixels: what its embedding climbs, and its rewards."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxil.learner.state import LearnerParams
+from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes
+from jaxil.networks.agent import make_agent_networks
+from jaxil.rewarders.matching import make_matching
+from jaxil.rewarders.rewarder import AgentView, Spec
+from jaxil.rewarders.sil import batch_distance, make_sil_rewarder
+
+SIDE, STEPS, BATCH = 12, 5, 8
+SPEC = Spec(2, 5, 2, expert_steps=STEPS, observation_shape=(SIDE, SIDE, 3))
+NETWORKS = make_agent_networks(
+    action_dim=2,
+    feature_dim=5,
+    hidden_dim=6,
+    observation="pixels",
+    channels=(4,),
+    kernel_sizes=(4,),
+    strides=(4,),
+    contrast=1.0,
+    mean=0.5,
+)
+MATCHING = make_matching(
+    cost="cosine", alignment="transport", epsilon=0.05, num_iterations=200
+)
+NOBODY = LearnerParams(None, None, None)
+
+
+@functools.cache
+def make_rewarder():
+    rewarder = make_sil_rewarder(
+        NETWORKS,
+        matching=MATCHING,
+        feature_dim=5,
+        learning_rate=3e-3,
+        batch_size=BATCH,
+        return_scale=10.0,
+        frame_stack=1,
+    )
+    return rewarder._replace(
+        update=jax.jit(rewarder.update),
+        rewards=jax.jit(rewarder.rewards),
+        plan=jax.jit(rewarder.plan),
+    )
+
+
+def draw(seed, *shape):
+    rng = np.random.default_rng(seed)
+    return rng.integers(0, 256, (*shape, SIDE, SIDE, 3), dtype=np.uint8)
+
+
+def make_episode(frames):
+    steps = len(frames) - 1
+    return Episode(frames, np.zeros((steps, 2), np.float32), np.zeros(steps))
+
+
+def make_experts():
+    frames = draw(50, 2, STEPS + 1)
+    return ExpertEpisodes(frames, np.full(2, STEPS + 1), np.zeros((2, 0, 0)))
+
+
+def start():
+    return make_rewarder().init(jax.random.key(0), SPEC, NOBODY)
+
+
+def climb(state, agent, expert, steps):
+    poison = jnp.full(agent.shape, jnp.nan)
+    view = AgentView(poison, jnp.full((BATCH, 5), jnp.nan), np.zeros((BATCH, 2)), agent)
+    distances = []
+    for _ in range(steps):
+        state, metrics = make_rewarder().update(
+            state,
+            NOBODY,
+            view,
+            ExpertBatch(expert, np.zeros((BATCH, 2))),
+            jax.random.key(1),
+        )
+        distances.append(float(metrics["sinkhorn/distance"]))
+    return state, distances
+
+
+def test_the_embedding_learns_to_tell_apart():
+    _, distances = climb(start(), draw(0, BATCH), draw(1, BATCH), 40)
+    assert distances[-1] > distances[0] + 0.1
+
+
+def test_rewards_fall_where_the_embedding_has_learned():
+    frames, experts = draw(2, STEPS + 1), make_experts()
+    state = start().replace(scale=jnp.ones(()))
+
+    def total(state):
+        return float(
+            jnp.sum(
+                make_rewarder().rewards(state, NOBODY, make_episode(frames), experts)[0]
+            )
+        )
+
+    before = total(state)
+    agent = np.resize(frames, (BATCH, *frames.shape[1:]))
+    expert = np.resize(experts.frames.reshape(-1, *frames.shape[1:]), agent.shape)
+    after, _ = climb(state, agent, expert, 40)
+    assert total(after) < before
+
+
+def test_the_gradient_is_that_of_the_distance():
+    # Of the regularised distance: the entropy counts too, so the two are compared in
+    # direction, where epsilon is small.
+    rng = np.random.default_rng(0)
+    agent, expert = (rng.normal(size=(6, 4)).astype(np.float32) for _ in range(2))
+    tight = make_matching(
+        cost="cosine", alignment="transport", epsilon=0.005, num_iterations=2000
+    )
+    gradient = jax.grad(lambda x: batch_distance(tight, x, expert))(agent)
+    numeric = np.zeros_like(agent)
+    for index in np.ndindex(*agent.shape):
+        step = np.zeros_like(agent)
+        step[index] = 1e-2
+        up, down = (batch_distance(tight, agent + s, expert) for s in (step, -step))
+        numeric[index] = (up - down) / 2e-2
+    cosine = np.sum(gradient * numeric) / (
+        np.linalg.norm(gradient) * np.linalg.norm(numeric)
+    )
+    assert cosine > 0.99
+
+
+def test_the_first_episode_returns_minus_ten_and_the_scale_stays():
+    rewarder, experts = make_rewarder(), make_experts()
+    rewards, state = rewarder.rewards(
+        start(), NOBODY, make_episode(draw(3, STEPS + 1)), experts
+    )
+    assert rewards.shape == (STEPS,)
+    np.testing.assert_allclose(jnp.sum(rewards), -10.0, rtol=1e-4)
+    other, later = rewarder.rewards(
+        state, NOBODY, make_episode(draw(4, STEPS + 1)), experts
+    )
+    assert later.scale == state.scale
+    assert not np.isclose(jnp.sum(other), -10.0)
+
+
+def test_the_plan_matches_a_demonstration_with_itself():
+    experts = make_experts()
+    plan = make_rewarder().plan(
+        start(), NOBODY, make_episode(experts.frames[1]), experts
+    )
+    assert plan.shape == (STEPS + 1, STEPS + 1)
+    assert np.all(np.argmax(plan, axis=1) == np.arange(STEPS + 1))
