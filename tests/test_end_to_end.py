@@ -27,6 +27,10 @@ def test_pdac_trains_shows_itself_and_is_evaluated_again(tmp_path):
     evals = read_csv(tmp_path / "eval.csv")
     np.testing.assert_array_equal(evals["frame"], [2000, 4000])
     assert np.all(evals["expert_task_return_mean"] > 800)
+    assert np.all(evals["wasserstein_to_expert"] > 0)
+    filmed = _filmed(tmp_path)
+    assert filmed["imitation_rewards"].shape == filmed["task_rewards"].shape == (100,)
+    assert "plan" not in filmed
     settings = json.loads((tmp_path / "config.json").read_text())
     assert settings["config"]["method"] == "pdac"
     assert settings["versions"]["jax"]
@@ -46,20 +50,45 @@ def test_pdac_trains_shows_itself_and_is_evaluated_again(tmp_path):
     assert (tmp_path / "train.csv").read_text() == before
 
 
-@pytest.mark.parametrize("method", ["psil", "drqv2", "zero"])
+@pytest.mark.parametrize("method", ["psil", "sil", "dac", "drqv2", "zero"])
 def test_method_trains(method, tmp_path):
     finished = run("launch", *small_run(method, tmp_path), "--config.total_frames=3000")
     assert finished.returncode == 0, finished.stderr
     train = read_csv(tmp_path / "train.csv")
     assert len(train["frame"]) == 3
-    if method == "psil":
+    if method in ("psil", "sil"):
         # The first episode is scaled to minus ten, and the scale then stays.
         assert train["imitation_return"][0] == pytest.approx(-10.0, rel=1e-4)
         assert len(set(train["sinkhorn/scale"])) == 1
+        filmed = _filmed(tmp_path)
+        assert filmed["plan"].shape == (101, 101)
+        np.testing.assert_allclose(filmed["plan"].sum(axis=1), 1 / 101, rtol=1e-3)
     elif method == "drqv2":
         np.testing.assert_array_equal(train["imitation_return"], train["task_return"])
+    elif method == "dac":
+        assert np.all(np.isfinite(train["discriminator/expert_logit"][1:]))
     else:
         assert not train["imitation_return"].any()
+
+
+def test_cloning_learns_without_playing(tmp_path):
+    finished = run("launch", *small_run("bc", tmp_path), "--config.total_frames=3000")
+    assert finished.returncode == 0, finished.stderr
+    train = read_csv(tmp_path / "train.csv")
+    assert train["actor/loss"][-1] < train["actor/loss"][0]
+    assert not np.any(np.isfinite(train["task_return"]))
+    evals = read_csv(tmp_path / "eval.csv")
+    np.testing.assert_array_equal(evals["frame"], [2000, 3000])
+    before = (tmp_path / "eval.csv").read_text()
+    again = run("launch", *small_run("bc", tmp_path), "--config.total_frames=3000")
+    assert again.returncode == 0
+    assert (tmp_path / "eval.csv").read_text() == before
+
+
+def _filmed(workdir):
+    newest = max((workdir / "videos").glob("*.npz"))
+    with np.load(newest) as arrays:
+        return dict(arrays)
 
 
 def test_state_expert_is_recorded_and_imitated(tmp_path):

@@ -124,6 +124,31 @@ def test_samples_are_windows_of_the_newest_episodes(
             np.testing.assert_allclose(batch.discount[item], discount, rtol=1e-6)
 
 
+def test_all_of_a_window_by_hand():
+    # Environment discounts 1, 1/2, 1; gamma 1/2: weights 1, 1/2, 1/8.
+    replay = make_replay(
+        observation_shape=(1,), observation_dtype=np.float32, frame_stack=1
+    )
+    replay.add_episode(
+        frames=np.array([[0], [1], [2], [3]], np.float32),
+        actions=np.array([[10, 0], [11, 0], [12, 0]], np.float32),
+        rewards=np.array([1, 10, 100], np.float32),
+        discounts=np.array([1, 0.5, 1], np.float32),
+    )
+    batch = replay.sample(np.random.default_rng(0), 2, windows=True)
+    assert batch.window is not None
+    np.testing.assert_array_equal(batch.window.observation, [[[0], [1], [2]]] * 2)
+    np.testing.assert_array_equal(batch.window.action[..., 0], [[10, 11, 12]] * 2)
+    np.testing.assert_array_equal(batch.window.weight, [[1, 0.5, 0.125]] * 2)
+    np.testing.assert_array_equal(batch.reward, [1 + 5 + 12.5] * 2)
+    np.testing.assert_array_equal(batch.next_observation, [[3]] * 2)
+    # The same draw without windows is the same batch.
+    plain = replay.sample(np.random.default_rng(0), 2)
+    assert plain.window is None
+    for name in ("observation", "action", "reward", "discount", "next_observation"):
+        np.testing.assert_array_equal(getattr(plain, name), getattr(batch, name))
+
+
 def test_every_window_is_drawn_equally_often():
     replay = make_replay()
     episodes = [make_episode(length, seed) for seed, length in enumerate((3, 2, 7))]

@@ -11,7 +11,7 @@ import optax
 import pytest
 
 from jaxil.learner.update import Learner, init_train_state, make_update_step
-from jaxil.maths.types import Batch, Episode, ExpertBatch, ExpertEpisodes
+from jaxil.maths.types import Batch, Episode, ExpertBatch, ExpertEpisodes, Window
 from jaxil.networks.agent import apply, critic_features, make_agent_networks
 from jaxil.rewarders.adversarial import make_adversarial_rewarder
 from jaxil.rewarders.matching import make_matching
@@ -370,6 +370,28 @@ def test_the_discriminator_moves_nothing_else():
     second, _ = jitted(learner)(state, batch, make_expert(1))
     assert any_difference(first.rewarder.params, second.rewarder.params)
     assert_identical(first.replace(rewarder=()), second.replace(rewarder=()))
+
+
+def test_rewards_made_anew_replace_the_stored_ones():
+    # A rewarder that pays the first action, plus what it has seen of itself.
+    paid = TASK._replace(relabel=lambda state, learner, window: window.action[..., 0])
+    batch, rng = make_batch(0), np.random.default_rng(0)
+    window = Window(
+        observation=np.stack([batch.observation] * 3, axis=1),
+        action=rng.normal(size=(BATCH, 3, ACTIONS)).astype(np.float32),
+        weight=rng.uniform(size=(BATCH, 3)).astype(np.float32),
+    )
+    reward = np.sum(window.weight * window.action[..., 0], axis=1)
+    anew, anew_metrics = jitted(make_learner(paid))(
+        make_state(make_learner(paid)), batch._replace(window=window), None
+    )
+    stored, stored_metrics = jitted(make_learner())(
+        make_state(make_learner()), batch._replace(reward=reward), None
+    )
+    chex.assert_trees_all_close(anew_metrics, stored_metrics, rtol=1e-5)
+    chex.assert_trees_all_close(anew.params, stored.params, rtol=1e-4, atol=1e-6)
+    _, other = jitted(make_learner())(make_state(make_learner()), batch, None)
+    assert abs(other["batch/reward"] - anew_metrics["batch/reward"]) > 0.1
 
 
 def test_a_rewarder_with_nothing_to_learn_is_left_alone():
