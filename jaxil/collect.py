@@ -15,9 +15,11 @@ jaxil's own file of pixels. Formats: jaxil states or pixels, ROT or PatchAIL pic
 folders of DrQ-v2 or V-D4RL episodes, videos, Minari and LeRobot v3 datasets.
 """
 
+import contextlib
 import pathlib
 import sys
 import tempfile
+from collections.abc import Iterator
 
 from absl import flags
 
@@ -49,7 +51,7 @@ def main(argv: list[str]) -> None:
             )
     elif "inspect" in jobs and values.output is not None:
         faults.append(f"--output={values.output} must be a folder that exists")
-    elif values.output is not None and "inspect" not in jobs:
+    elif values.output is not None:
         faults += _output_faults(values)
     if faults:
         raise command.UsageError(command.listing(faults))
@@ -104,26 +106,16 @@ def _record(values: flags.FlagValues) -> None:
 def _inspect(values: flags.FlagValues) -> None:
     """Prints a summary; writes a contact sheet and a video."""
     from jaxil import inspection
-    from jaxil.host.readers.recording import FormatError
-    from jaxil.host.states import DemonstrationError
     from jaxil.host.video import write_video
 
     path = pathlib.Path(values.inspect)
-    try:
+    with _told(path, f"--inspect={path}"):
         seen = inspection.inspect(
             path,
             image_size=values.image_size or _INSPECTED_SIZE,
             render_quality=values.render_quality,
             max_bytes=_max_bytes(),
         )
-    except DemonstrationError as error:
-        raise command.UsageError(str(error)) from error
-    except FormatError as error:
-        raise command.UsageError(f"{path} {error}.") from error
-    except OSError as error:
-        raise command.UsageError(
-            f"--inspect={path} cannot be read ({error.strerror or error})"
-        ) from error
     name = path.resolve().stem
     # Never the name of what is shown, which may be a video in this very folder.
     folder = pathlib.Path(values.output or ".")
@@ -145,10 +137,9 @@ def _convert(values: flags.FlagValues) -> None:
     from jaxil import inspection
     from jaxil.host import foreign, states
     from jaxil.host.readers import own
-    from jaxil.host.readers.recording import FormatError
 
     path, output = pathlib.Path(values.convert), pathlib.Path(values.output)
-    try:
+    with _told(path, f"--convert={path} --output={output}"):
         if states.recognises(path):
             recording = inspection.render_recording(
                 path,
@@ -162,19 +153,29 @@ def _convert(values: flags.FlagValues) -> None:
             if values.image_size is not None:
                 recording = foreign.of_size(recording, values.image_size)
         own.write_pixels(output, recording, origin=f"{recording.kind}, {path.name}")
-    except states.DemonstrationError as error:
-        raise command.UsageError(str(error)) from error
-    except FormatError as error:
-        raise command.UsageError(f"{path} {error}.") from error
-    except OSError as error:
-        raise command.UsageError(
-            f"--convert={path} --output={output}: {error}"
-        ) from error
     size = output.stat().st_size / 1e6
     print(
         f"{output}: {recording.num_episodes} episodes of {recording.kind}, "
         f"{size:.2f} MB"
     )
+
+
+@contextlib.contextmanager
+def _told(path: pathlib.Path, flags_given: str) -> Iterator[None]:
+    """Turns what may be wrong with a user's file into one message."""
+    from jaxil.host.readers.recording import FormatError
+    from jaxil.host.states import DemonstrationError
+
+    try:
+        yield
+    except DemonstrationError as error:
+        raise command.UsageError(str(error)) from error
+    except FormatError as error:
+        raise command.UsageError(f"{path} {error}.") from error
+    except OSError as error:
+        raise command.UsageError(
+            f"{flags_given} cannot be read or written ({error.strerror or error})"
+        ) from error
 
 
 def _output_faults(values: flags.FlagValues) -> list[str]:

@@ -12,7 +12,7 @@ from jaxil.host import environment as environments
 from jaxil.host import foreign, mismatch, rendering, states
 from jaxil.host.readers.recording import FormatError
 from jaxil.host.stacking import gather_stacks
-from jaxil.host.states import StateDemonstrations, fault
+from jaxil.host.states import StateDemonstrations, fault, unreadable
 
 _WAY_OUT = (
     "Repair or replace it; `python -m jaxil.collect --inspect=FILE` shows what a file "
@@ -291,11 +291,7 @@ def _load_pixels(path: pathlib.Path, **settings: Any) -> Demonstrations:
         parts = sorted(path.rglob("*")) if path.is_dir() else [path]
         stamps = tuple((str(part), part.stat().st_mtime_ns) for part in parts)
     except OSError as error:
-        raise fault(
-            path,
-            f"cannot be read ({error.strerror or error})",
-            "Check the path in demonstrations.source",
-        ) from error
+        raise unreadable(path, error) from error
     return _read_pixels(path, stamps, **settings)
 
 
@@ -335,11 +331,7 @@ def _read_pixels(
             max_bytes=max_bytes,
         )
     except OSError as error:
-        raise fault(
-            path,
-            f"cannot be read ({error.strerror or error})",
-            "Check the path in demonstrations.source",
-        ) from error
+        raise unreadable(path, error) from error
     except FormatError as error:
         raise fault(path, str(error), _WAY_OUT) from error
     recording = read.recording

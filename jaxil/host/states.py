@@ -172,11 +172,7 @@ def read_states(
         arrays = archive.read_archive(path, max_bytes=limits)
         metadata = json.loads(str(arrays.pop("metadata")))
     except OSError as error:
-        raise fault(
-            path,
-            f"cannot be read ({error.strerror or error})",
-            "Check the path in demonstrations.source",
-        ) from error
+        raise unreadable(path, error) from error
     except (json.JSONDecodeError, RecursionError) as error:
         raise fault(path, f"has metadata that are not JSON ({error})") from error
     except ValueError as error:
@@ -210,6 +206,15 @@ def _shipped_folder() -> pathlib.Path:
 def fault(path: pathlib.Path, what: str, way_out: str = _REMAKE) -> DemonstrationError:
     """Returns the error that says what is wrong with a file, and what helps."""
     return DemonstrationError(f"{path} {what}. {way_out}.")
+
+
+def unreadable(path: pathlib.Path, error: OSError) -> DemonstrationError:
+    """Returns what to raise where the system refuses a file."""
+    return fault(
+        path,
+        f"cannot be read ({error.strerror or error})",
+        "Check the path in demonstrations.source",
+    )
 
 
 def _check(path: pathlib.Path, demonstrations: StateDemonstrations) -> None:

@@ -376,6 +376,15 @@ def test_a_program_that_has_more_to_say_is_not_waited_for():
 
 
 def test_whoever_stops_listening_ends_the_program(path):
+    before = children()
     frames = clips.decode(path, max_frame_bytes=LIMIT, cpu_seconds=5)
     next(frames)
+    assert children() > before
     del frames  # a warning about a program that still runs would be an error
+    assert children() == before
+
+
+def children() -> set[str]:
+    """Returns the programs that this one has started and not yet buried."""
+    tasks = pathlib.Path("/proc/self/task").glob("*/children")
+    return {child for task in tasks for child in task.read_text().split()}
