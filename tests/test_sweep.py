@@ -159,7 +159,7 @@ def test_a_folder_with_another_run_is_refused(tmp_path):
 
 
 def test_clusters_that_are_not_there(monkeypatch):
-    monkeypatch.setattr(clusters.shutil, "which", lambda name: None)
+    monkeypatch.setattr(clusters.slurm.shutil, "which", lambda name: None)
     monkeypatch.setattr(clusters.importlib.util, "find_spec", lambda name: None)
     many = Cluster("slurm", num_workers=10**6, hours=0.0, num_gpus=2, num_cpus=0)
     told = "\n".join(clusters.problems(many, starts=True))
@@ -171,10 +171,19 @@ def test_clusters_that_are_not_there(monkeypatch):
     assert "local, slurm, debug" in fault
 
 
+def test_slurm_commands_without_a_cluster_are_no_slurm(tmp_path, monkeypatch):
+    for name, text in (("sbatch", ""), ("sinfo", "echo 'no controller' >&2; exit 1")):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    (fault,) = clusters.problems(Cluster("slurm"), starts=True)
+    assert "no Slurm here: sinfo fails (no controller)" in fault
+
+
 def test_wrong_use_of_the_command_ends_with_status_2(tmp_path):
     done = _sweep("--methods=gail", "--seeds=0", "--cluster=pbs", "--tasks=walker_wlak")
     assert done.returncode == 2
-    for words in ("gail", "--seeds=0", "'pbs'", "--workdir is missing"):
+    for words in ("gail", "--seeds=0", "'pbs'", "--workdir is missing", "walker_walk"):
         assert words in done.stderr
     assert "Traceback" not in done.stderr
 

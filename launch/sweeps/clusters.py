@@ -6,7 +6,6 @@ import glob
 import importlib.util
 import os
 import pathlib
-import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -60,10 +59,10 @@ def problems(cluster: Cluster, *, starts: bool) -> Iterator[str]:
             f"--cluster={cluster.name!r} starts jobs with submitit, which is not "
             "installed: pip install 'jaxil[cluster]', or use --cluster=debug"
         )
-    if starts and cluster.name == "slurm" and shutil.which("sbatch") is None:
+    if starts and cluster.name == "slurm" and (fault := slurm.fault()):
         yield (
-            "--cluster='slurm': no Slurm here: there is no command sbatch; run this on "
-            "a login node of your cluster, or use --cluster=local"
+            f"--cluster='slurm': no Slurm here: {fault}; run this on a login node of "
+            "your cluster, or use --cluster=local"
         )
     most = len(os.sched_getaffinity(0))
     if cluster.num_workers is not None and not 1 <= cluster.num_workers <= most:

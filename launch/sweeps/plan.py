@@ -88,7 +88,8 @@ def make_runs(
     faults = Faults()
     for sentence in _request_problems(request):
         faults.add(sentence)
-    choices = _choices(request)
+    # Without any method, one stands in, so that faults of tasks are told as well.
+    choices = _choices(request) or [_Choice(figures.Variant("drqv2"), False)]
     runs: list[list[Run]] = []
     groups = [(task, choice) for task in request.tasks for choice in choices]
     for task, choice in groups:

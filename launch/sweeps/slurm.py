@@ -16,6 +16,7 @@ _REQUEUES = 1000  # on timeouts: a run is worth going on with until it is done
 # How long before the time limit a run is asked to save: a checkpoint takes seconds,
 # a decision that waits for a compilation a minute.
 _SAVING_SECONDS = 120
+_ANSWER_SECONDS = 60
 _PATIENCE_SECONDS = 300.0  # file locks of a node that broke down last a while
 
 
@@ -65,6 +66,26 @@ def submit(
             state.note_slurm_job(run, job.job_id)
 
 
+def fault() -> str | None:
+    """Returns why no job can be queued from here; None if one can."""
+    if shutil.which("sbatch") is None:
+        return "there is no command sbatch"
+    try:
+        subprocess.run(
+            ["sinfo", "--noheader"],
+            check=True,
+            capture_output=True,
+            text=True,
+            timeout=_ANSWER_SECONDS,
+        )
+    except subprocess.CalledProcessError as error:
+        said = error.stderr.strip().splitlines()
+        return f"sinfo fails ({said[-1] if said else error.returncode})"
+    except (subprocess.SubprocessError, OSError) as error:
+        return f"sinfo fails ({error})"
+    return None
+
+
 def queued_jobs(runs: Sequence[Run]) -> frozenset[str]:
     """Returns which Slurm jobs of this user wait or run; none if no run has one."""
     has_jobs = any((run.folder / "slurm_job").exists() for run in runs)
@@ -74,7 +95,11 @@ def queued_jobs(runs: Sequence[Run]) -> frozenset[str]:
     arguments.append(f"--user={getpass.getuser()}")
     try:
         listed = subprocess.run(
-            arguments, check=True, capture_output=True, text=True, timeout=60
+            arguments,
+            check=True,
+            capture_output=True,
+            text=True,
+            timeout=_ANSWER_SECONDS,
         )
     except (subprocess.SubprocessError, OSError):
         return frozenset()  # without it a run may be queued twice, but not done twice
