@@ -216,13 +216,35 @@ def sample(
       Observations uint8 [B, H, W, 3 * frame_stack] or float32 [B, S], and actions
       [B, A]; A is 0 where the demonstrations have none.
     """
+    indices, actions = sample_indices(
+        demonstrations, rng, batch_size, frame_stack=frame_stack
+    )
+    # As one long row of frames, without a copy, from which stacks are gathered.
+    frames = demonstrations.frames.reshape(-1, *demonstrations.frames.shape[2:])
+    return gather_stacks(frames, indices), actions
+
+
+def sample_indices(
+    demonstrations: Demonstrations,
+    rng: np.random.Generator,
+    batch_size: int,
+    *,
+    frame_stack: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draws what `sample` draws, with the places of frames instead of pixels.
+
+    Args:
+      demonstrations: see `sample`, as all others.
+
+    Returns:
+      int32 [B, frame_stack], the frames of each stack, the oldest first, as places in
+      the frames of all episodes laid end to end, [K * (N + 1), ...]; actions [B, A].
+    """
     num_steps = demonstrations.num_frames - 1  # no action follows the last frame
     ends = np.cumsum(num_steps)
     drawn = rng.integers(ends[-1], size=batch_size)
     episodes = np.searchsorted(ends, drawn, side="right")
     steps = drawn - (ends - num_steps)[episodes]
-    # As one long row of frames, without a copy, from which stacks are gathered.
-    frames = demonstrations.frames.reshape(-1, *demonstrations.frames.shape[2:])
     ages = np.arange(frame_stack - 1, -1, -1)
     times = np.maximum(steps[:, None] - ages, 0)
     indices = episodes[:, None] * demonstrations.frames.shape[1] + times
@@ -231,7 +253,7 @@ def sample(
         if demonstrations.actions is None
         else demonstrations.actions[episodes, steps]
     )
-    return gather_stacks(frames, indices), actions
+    return indices.astype(np.int32), actions
 
 
 def _path_of(source: str | os.PathLike, task: str) -> pathlib.Path:

@@ -25,7 +25,10 @@ class Window(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Transitions over n steps, as the learner gets them."""
+    """Transitions over n steps, as the learner gets them.
+
+    From `sample_indices`, with slots of frames in the place of pixels.
+    """
 
     observation: np.ndarray  # [B, H, W, C * stack] uint8, or [B, S] float32: o_t
     action: np.ndarray  # [B, A] float32: a_t
@@ -154,6 +157,13 @@ class Replay:
         self._index_starts()
 
     @property
+    def frames(self) -> np.ndarray:
+        """The ring of frames itself, read-only: [num_slots, H, W, C] or [.., S]."""
+        ring = self._frames.view()
+        ring.flags.writeable = False
+        return ring
+
+    @property
     def num_steps_stored(self) -> int:
         """Transitions in the replay now."""
         return self._num_steps_stored
@@ -228,19 +238,30 @@ class Replay:
         Raises:
           IndexError: if it is not stored.
         """
-        if not self.oldest_episode <= index < self._num_episodes_added:
-            raise IndexError(
-                f"episode {index} is not stored: the replay holds"
-                f" {self.oldest_episode} to {self._num_episodes_added - 1}"
-            )
-        start, num_steps = self._stored[index - self.oldest_episode]
-        slots = (start + np.arange(num_steps + 1)) % len(self._frames)
+        slots = self.slots(index)
         return Episode(
             frames=self._frames[slots],
             actions=self._actions[slots[:-1]],
             rewards=self._rewards[slots[:-1]],
             discounts=self._discounts[slots[:-1]],
         )
+
+    def slots(self, index: int) -> np.ndarray:
+        """Returns where the frames of a stored episode lie in `frames`, [T + 1].
+
+        Args:
+          index: see `episode`.
+
+        Raises:
+          IndexError: if it is not stored.
+        """
+        if not self.oldest_episode <= index < self._num_episodes_added:
+            raise IndexError(
+                f"episode {index} is not stored: the replay holds"
+                f" {self.oldest_episode} to {self._num_episodes_added - 1}"
+            )
+        start, num_steps = self._stored[index - self.oldest_episode]
+        return (start + np.arange(num_steps + 1)) % len(self._frames)
 
     def can_sample(self) -> bool:
         """Says whether any stored episode is long enough for a window of n steps."""
@@ -267,6 +288,38 @@ class Replay:
         Raises:
           ValueError: if no stored episode is as long as a window.
         """
+        drawn = self.sample_indices(rng, batch_size, windows=windows)
+        # Both ends of the windows in one go: the work is shared out among threads.
+        # Where all of a window is asked for, its inside comes first of all.
+        first = drawn.observation[None]
+        if drawn.window is not None:
+            first = drawn.window.observation.swapaxes(0, 1)
+        slots = np.concatenate([first, drawn.next_observation[None]])
+        stacks = gather_stacks(self._frames, slots.reshape(-1, self._frame_stack))
+        stacks = stacks.reshape(*slots.shape[:2], *stacks.shape[1:])
+        if drawn.window is not None:
+            inside = np.ascontiguousarray(stacks[:-1].swapaxes(0, 1))
+            drawn = drawn._replace(window=drawn.window._replace(observation=inside))
+        return drawn._replace(observation=stacks[0], next_observation=stacks[-1])
+
+    def sample_indices(
+        self, rng: np.random.Generator, batch_size: int, *, windows: bool = False
+    ) -> Batch:
+        """Draws what `sample` draws, with the places of frames instead of pixels.
+
+        Args:
+          rng: see `sample`; the same one gives the same transitions.
+          batch_size: B >= 1.
+          windows: see `sample`.
+
+        Returns:
+          A batch in which each stack [H, W, C * stack] is the int32 [stack] of its
+          frames' slots in `frames`, the oldest first. They hold until the next
+          episode is added.
+
+        Raises:
+          ValueError: if no stored episode is as long as a window.
+        """
         if not self.can_sample():
             raise ValueError(
                 f"num_steps_stored = {self._num_steps_stored}: expected an episode of"
@@ -276,37 +329,30 @@ class Replay:
         which = np.searchsorted(self._last_starts, flat, side="right")
         steps = flat - self._first_starts[which]  # t of each window in its episode
         starts = self._episode_slots[which]
-        num_slots = len(self._frames)
 
         slots = (starts + steps)[:, None] + np.arange(self._window)
-        slots %= num_slots
+        slots %= len(self._frames)
         rewards = self._rewards[slots].astype(np.float64)
         discounts = self._discount_factor * self._discounts[slots].astype(np.float64)
         discounts = np.cumprod(discounts, axis=1)
         # A reward is discounted by what lies before it, not by its own step's discount.
         weights = np.concatenate([np.ones((batch_size, 1)), discounts[:, :-1]], axis=1)
 
-        # Both ends of the windows in one go: the work is shared out among threads.
-        # Where all of a window is asked for, its inside comes first of all.
-        ages = np.arange(self._window + 1) if windows else np.array([0, self._window])
-        times = (steps + ages[:, None]).ravel()
-        observations = self._observations(np.tile(starts, len(ages)), times)
-        observations = observations.reshape(
-            len(ages), batch_size, *observations.shape[1:]
-        )
-        return Batch(
-            observation=observations[0],
-            action=self._actions[slots[:, 0]],
-            reward=(weights * rewards).sum(axis=1).astype(np.float32),
-            discount=discounts[:, -1].astype(np.float32),
-            next_observation=observations[-1],
-            window=Window(
-                observation=np.ascontiguousarray(observations[:-1].swapaxes(0, 1)),
+        window = None
+        if windows:
+            times = steps[:, None] + np.arange(self._window)
+            window = Window(
+                observation=self._stack_slots(starts[:, None], times),
                 action=self._actions[slots],
                 weight=weights.astype(np.float32),
             )
-            if windows
-            else None,
+        return Batch(
+            observation=self._stack_slots(starts, steps),
+            action=self._actions[slots[:, 0]],
+            reward=(weights * rewards).sum(axis=1).astype(np.float32),
+            discount=discounts[:, -1].astype(np.float32),
+            next_observation=self._stack_slots(starts, steps + self._window),
+            window=window,
         )
 
     def check_valid(self) -> tuple[bool, str]:
@@ -385,11 +431,15 @@ class Replay:
         self._episode_slots = np.array([stored.start for stored in self._stored], int)
         self._num_starts = int(counts.sum())
 
-    def _observations(self, starts: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        """Makes o_t of the episodes in the slots `starts` at the given steps."""
+    def _stack_slots(self, starts: np.ndarray, steps: np.ndarray) -> np.ndarray:
+        """Says where the frames of o_t lie, of episodes that begin in slots `starts`.
+
+        Returns:
+          int32, a last axis of frames added, the oldest first.
+        """
         ages = np.arange(self._frame_stack)[::-1]
-        slots = starts[:, None] + np.maximum(steps[:, None] - ages, 0)
-        return gather_stacks(self._frames, slots % len(self._frames))
+        slots = starts[..., None] + np.maximum(steps[..., None] - ages, 0)
+        return (slots % len(self._frames)).astype(np.int32)
 
 
 def _require(condition: bool, name: str, value: object, rule: object) -> None:

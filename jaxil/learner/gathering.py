@@ -1,0 +1,133 @@
+"""Stacks of frames, put together on the device from the frames that lie there."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxil.learner.state import TrainState
+from jaxil.learner.update import UpdateStep
+from jaxil.maths.types import Batch, Data, ExpertBatch, Metrics
+
+# (state, frames, batch, expert) -> (state, metrics); see `make_gathering_step`.
+GatheringStep = Callable[
+    [TrainState, "Frames | None", Batch | None, ExpertBatch | None],
+    tuple[TrainState, Metrics],
+]
+
+
+class Frames(NamedTuple):
+    """All frames that batches are drawn from, on the device.
+
+    Attributes:
+      agent: those of the replay, uint8 [N, H, W, 3] or float32 [N, S]; None for a
+        method that plays no episodes.
+      expert: the demonstrations', uint8 [K, M, H, W, 3] or float32 [K, M, S]; None
+        for a method that samples none.
+    """
+
+    agent: Data | None
+    expert: Data | None
+
+
+def gather_stacks(frames: Data, slots: Data) -> Array:
+    """Gathers frames and folds each stack of them into the channels.
+
+    Args:
+      frames: shape [N, H, W, C], or [N, S] if F is 1.
+      slots: int32 [..., F] in [0, N): the frames of each stack, the oldest first.
+
+    Returns:
+      Shape [..., H, W, F * C], or [..., S].
+    """
+    chex.assert_rank(frames, {2, 4})
+    gathered = jnp.asarray(frames).at[slots].get(mode="promise_in_bounds")
+    if frames.ndim == 2:
+        chex.assert_axis_dimension(slots, -1, 1)
+        return jnp.squeeze(gathered, -2)
+    # [..., F, H, W, C] to [..., H, W, F, C], whose last two axes are the channels.
+    gathered = jnp.moveaxis(gathered, -4, -2)
+    return gathered.reshape(*gathered.shape[:-2], -1)
+
+
+def gather_batch(frames: Data, batch: Batch) -> Batch:
+    """Puts pixels in the place of slots.
+
+    Args:
+      frames: see `gather_stacks`.
+      batch: as the replay's `sample_indices` draws it: observations int32 [B, F], those
+        of a window [B, n, F].
+    """
+    window = batch.window
+    if window is not None:
+        window = window._replace(observation=gather_stacks(frames, window.observation))
+    return batch._replace(
+        observation=gather_stacks(frames, batch.observation),
+        next_observation=gather_stacks(frames, batch.next_observation),
+        window=window,
+    )
+
+
+def gather_expert(frames: Data, expert: ExpertBatch) -> ExpertBatch:
+    """Puts pixels in the place of slots.
+
+    Args:
+      frames: of whole episodes, see `Frames.expert`.
+      expert: observations int32 [B, F], places in the episodes laid end to end.
+    """
+    chex.assert_rank(frames, {3, 5})
+    row = jnp.asarray(frames).reshape(-1, *frames.shape[2:])
+    return expert._replace(observation=gather_stacks(row, expert.observation))
+
+
+def make_gathering_step(step: UpdateStep) -> GatheringStep:
+    """Returns a learning step that is told where the frames lie.
+
+    With frames, batches hold slots in the place of pixels, see `gather_batch` and
+    `gather_expert`; with None, they are those that `step` takes.
+
+    Args:
+      step: the learning step.
+    """
+
+    def gathering_step(
+        state: TrainState,
+        frames: Frames | None,
+        batch: Batch | None,
+        expert: ExpertBatch | None,
+    ) -> tuple[TrainState, Metrics]:
+        if frames is not None and batch is not None:
+            batch = gather_batch(frames.agent, batch)
+        if frames is not None and expert is not None:
+            expert = gather_expert(frames.expert, expert)
+        return step(state, batch, expert)
+
+    return gathering_step
+
+
+def make_repeated_step(step: GatheringStep) -> GatheringStep:
+    """Returns a step that makes several updates in one call.
+
+    Its batches have one axis more, of length n, in front; its metrics are those of the
+    last update.
+
+    Args:
+      step: the learning step.
+    """
+
+    def repeated_step(
+        state: TrainState,
+        frames: Frames | None,
+        batch: Batch | None,
+        expert: ExpertBatch | None,
+    ) -> tuple[TrainState, Metrics]:
+        def update(state: TrainState, drawn: tuple) -> tuple[TrainState, Metrics]:
+            return step(state, frames, *drawn)
+
+        state, metrics = jax.lax.scan(update, state, (batch, expert))
+        return state, jax.tree.map(lambda values: values[-1], metrics)
+
+    return repeated_step
