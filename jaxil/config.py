@@ -25,6 +25,7 @@ OBSERVATIONS = ("pixels", "state")
 COSTS = ("cosine", "euclidean")
 ALIGNMENTS = ("transport", "time")
 RENDER_QUALITIES = ("paper", "fast", "smooth")
+COMPUTE_DTYPES = ("float32", "bfloat16")
 
 # The paper's budgets, in environment frames; other tasks get the larger one.
 _EASY_TASKS = ("cartpole_swingup", "finger_spin", "ball_in_cup_catch")
@@ -111,6 +112,16 @@ def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Conf
         per_update = config.update_every_steps * config.action_repeat
         config.total_frames = _CLONING_UPDATES * per_update
 
+    # Speed, on a GPU. A copy of the replay's frames lies on the device and batches send
+    # only their places there; the samples are the same, and the ring in the host's
+    # memory stays what checkpoints save.
+    config.replay_on_device = False
+    # So many updates are sent to the device at once: less waiting, but the policy that
+    # acts lags by that less one. Episode ends, evaluations and checkpoints see all.
+    config.updates_per_dispatch = 1
+    # Of convolutions and the product that follows them; all that is kept is float32.
+    config.compute_dtype = "float32"  # or "bfloat16"
+
     # Looking at it.
     config.eval_every_frames = 10_000
     config.num_eval_episodes = 10
@@ -186,6 +197,7 @@ _RANGES: dict[str, tuple[float, float, str]] = {
     "seed_frames": (1, 10**9, "frames before the first update; 4000 in DrQ-v2"),
     "exploration_steps": (0, 10**9, "agent steps of uniform actions; 2000 in DrQ-v2"),
     "update_every_steps": (1, 10**6, "2 in the paper"),
+    "updates_per_dispatch": (1, 1_000, "1 lets the policy follow each update"),
     "feature_dim": (1, 10**5, "50 in the paper"),
     "hidden_dim": (1, 10**5, "1024 in the paper"),
     "noise_clip": (0.0, 2.0, "0.3 in DrQ-v2"),
@@ -235,6 +247,8 @@ def _problems(config: Config, known_tasks: tuple[str, ...]) -> Iterator[str]:
         yield unknown_name("task", config.task, known_tasks)
     if config.observation not in OBSERVATIONS:
         yield unknown_name("observation", config.observation, OBSERVATIONS)
+    if config.compute_dtype not in COMPUTE_DTYPES:
+        yield unknown_name("compute_dtype", config.compute_dtype, COMPUTE_DTYPES)
     if config.render_quality not in RENDER_QUALITIES:
         yield unknown_name("render_quality", config.render_quality, RENDER_QUALITIES)
     for field, known in (("cost", COSTS), ("alignment", ALIGNMENTS)):

@@ -19,11 +19,11 @@ from jaxil.host.progress import ProgressLine
 from jaxil.host.replay import Replay
 from jaxil.host.states import DemonstrationError
 from jaxil.learner.cloning import make_cloning_step
+from jaxil.learner.gathering import Step, make_gathering_step, make_repeated_step
 from jaxil.learner.policy import Exploit, Explore, make_exploit, make_explore
 from jaxil.learner.state import TrainState
 from jaxil.learner.update import (
     Learner,
-    UpdateStep,
     init_train_state,
     make_update_step,
 )
@@ -48,7 +48,9 @@ class Agent(NamedTuple):
     """The compiled functions of a run, and what they start from.
 
     Attributes:
-      update_step: (state, batch, expert batch) -> (state, metrics); donates state.
+      update_step: (state, batch, expert batch, frames=None) -> (state, metrics);
+        donates state; see `gathering.make_gathering_step`.
+      repeated_step: the same for several batches, see `gathering.make_repeated_step`.
       explore: see `policy.make_explore`.
       exploit: see `policy.make_exploit`.
       rewards: the rewarder's, at episode end.
@@ -57,7 +59,8 @@ class Agent(NamedTuple):
       init_state: () -> the state before the first update.
     """
 
-    update_step: UpdateStep
+    update_step: Step
+    repeated_step: Step
     explore: Explore
     exploit: Exploit
     rewards: Any
@@ -349,9 +352,11 @@ def make_agent(
     step = make_update_step(learner)
     if config.method == "bc":
         step = make_cloning_step(learner, std=config.cloning.std)
+    step = make_gathering_step(step)
     return Agent(
         # The old state is dead after the call, so XLA may reuse its memory.
         update_step=jax.jit(step, donate_argnums=0),
+        repeated_step=jax.jit(make_repeated_step(step), donate_argnums=0),
         explore=jax.jit(make_explore(networks, schedule)),
         exploit=jax.jit(make_exploit(networks)),
         rewards=jax.jit(rewarder.rewards),

@@ -21,7 +21,8 @@ from jaxil.host.progress import ProgressLine
 from jaxil.host.signals import StopOnSignals
 from jaxil.host.stopwatch import Stopwatch, TimedEnvironment
 from jaxil.learner.state import TrainState
-from jaxil.maths.types import Batch, Episode, ExpertBatch
+from jaxil.maths.types import Episode
+from jaxil.updates import Updates
 
 # Names of NumPy's random streams: every draw is keyed by (seed, stream, step), so
 # that a resumed run repeats those of an unbroken one without any stored state.
@@ -84,6 +85,9 @@ class Run:
         self.decisions: list[Decision] = []
         self.stop_asked = False
         self.state: TrainState = self._restore_or_init()
+        self.updates = Updates(
+            config, self.agent, self.replay, demonstrations, self.experts
+        )
         self.exploration_key = jax.random.fold_in(
             jax.random.key(config.seed), _EXPLORATION_KEY
         )
@@ -137,6 +141,7 @@ class Run:
                 ):
                     self.save()
             self.progress.update(self.frame, self.stopwatch.seconds, self.returns)
+        self.stopwatch.timed("update", self.flush)()
 
     def clone(self) -> None:
         """Trains on the demonstrations alone, without playing.
@@ -149,6 +154,7 @@ class Run:
             counters.num_steps += config.update_every_steps
             self.stopwatch.timed("update", self.update)()
             if self.is_due(counters.last_eval_step, config.eval_every_frames):
+                self.flush()
                 counters.seconds = time.monotonic() - self.started
                 metrics = {name: float(value) for name, value in self.metrics.items()}
                 self.require_finite(metrics)
@@ -197,34 +203,24 @@ class Run:
         )
 
     def update(self) -> None:
-        """Samples and learns once."""
-        rng, config = self._rng(_SAMPLED_BATCHES), self.config
-        batch = expert = None
-        if config.method == "bc":
-            expert = self.sample_expert(rng, config.cloning.batch_size)
-        else:
-            windows = self.agent.rewarder.relabel is not None
-            sampled = self.replay.sample(rng, config.batch_size, windows=windows)
-            batch = Batch(*sampled)
-            if self.agent.rewarder.samples_expert:
-                expert = self.sample_expert(rng, config.discriminator.batch_size)
-        self.state, self.metrics = self.agent.update_step(self.state, batch, expert)
+        """Draws a batch, and learns where enough of them are together."""
+        if self.updates.collect(self._rng(_SAMPLED_BATCHES)):
+            self.flush()
 
-    def sample_expert(self, rng: np.random.Generator, batch_size: int) -> ExpertBatch:
-        """Draws from the demonstrations."""
-        assert self.demonstrations is not None
-        drawn = host_demonstrations.sample(
-            self.demonstrations,
-            rng,
-            batch_size,
-            frame_stack=experiment.stack_size(self.config),
-        )
-        return ExpertBatch(*drawn)
+    def flush(self) -> None:
+        """Makes the updates that are due and not made yet."""
+        self.state, metrics = self.updates.run(self.state)
+        if metrics is not None:
+            self.metrics = metrics
 
     def finish_episode(self) -> None:
         """Rewards a finished episode once, and stores it for good."""
         episode = join(self.decisions)
         self.decisions = []
+        # Updates may not see an episode that entered after they were due, and rewards
+        # are to come from all that was learned; their own clock starts after it.
+        self.stopwatch.timed("update", self.flush)()
+        self.stopwatch.timed("update", jax.block_until_ready)(self.state.num_updates)
         start = time.perf_counter()
         rewards = self.reward(episode)
         self.stopwatch.reward_seconds += time.perf_counter() - start
@@ -241,6 +237,7 @@ class Run:
             rewards=rewards,
             discounts=episode.discounts,
         )
+        self.updates.episode_added()
         self.counters.seconds = time.monotonic() - self.started
         self.returns = {
             "task": float(np.sum(episode.task_rewards)),
@@ -343,6 +340,7 @@ class Run:
 
     def save(self) -> None:
         """Writes a checkpoint: learner, counters, and the replay's new episodes."""
+        self.flush()
         self.counters.last_checkpoint_step = self.counters.num_steps
         self.counters.seconds = time.monotonic() - self.started
         self.checkpoints.save(

@@ -42,6 +42,8 @@ class TapeRun(train.Run):
         self.stopwatch = train.Stopwatch()
         self.decisions: list[Decision] = []
         self.tape: list[str] = []
+        self.state: Any = None
+        self.updates: Any = types.SimpleNamespace(run=lambda state: (state, None))
         self.returns = {}
         self.stop_asked = False
         self.progress = types.SimpleNamespace(update=lambda *_: None)

@@ -9,14 +9,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxil.learner.state import TrainState
-from jaxil.learner.update import UpdateStep
 from jaxil.maths.types import Batch, Data, ExpertBatch, Metrics
 
-# (state, frames, batch, expert) -> (state, metrics); see `make_gathering_step`.
-GatheringStep = Callable[
-    [TrainState, "Frames | None", Batch | None, ExpertBatch | None],
-    tuple[TrainState, Metrics],
-]
+Step = Callable[..., tuple[TrainState, Metrics]]
 
 
 class Frames(NamedTuple):
@@ -83,21 +78,22 @@ def gather_expert(frames: Data, expert: ExpertBatch) -> ExpertBatch:
     return expert._replace(observation=gather_stacks(row, expert.observation))
 
 
-def make_gathering_step(step: UpdateStep) -> GatheringStep:
-    """Returns a learning step that is told where the frames lie.
+def make_gathering_step(step: Step) -> Step:
+    """Returns a learning step that may be told where the frames lie.
 
-    With frames, batches hold slots in the place of pixels, see `gather_batch` and
-    `gather_expert`; with None, they are those that `step` takes.
+    (state, batch, expert, frames) -> (state, metrics). With frames, batches hold slots
+    in the place of pixels, see `gather_batch` and `gather_expert`; without, they are
+    those that `step` takes.
 
     Args:
-      step: the learning step.
+      step: the learning step, (state, batch, expert) -> (state, metrics).
     """
 
     def gathering_step(
         state: TrainState,
-        frames: Frames | None,
         batch: Batch | None,
         expert: ExpertBatch | None,
+        frames: Frames | None = None,
     ) -> tuple[TrainState, Metrics]:
         if frames is not None and batch is not None:
             batch = gather_batch(frames.agent, batch)
@@ -108,24 +104,24 @@ def make_gathering_step(step: UpdateStep) -> GatheringStep:
     return gathering_step
 
 
-def make_repeated_step(step: GatheringStep) -> GatheringStep:
-    """Returns a step that makes several updates in one call.
+def make_repeated_step(step: Step) -> Step:
+    """Returns a step that makes n updates in one call.
 
     Its batches have one axis more, of length n, in front; its metrics are those of the
     last update.
 
     Args:
-      step: the learning step.
+      step: as `make_gathering_step` returns it.
     """
 
     def repeated_step(
         state: TrainState,
-        frames: Frames | None,
         batch: Batch | None,
         expert: ExpertBatch | None,
+        frames: Frames | None = None,
     ) -> tuple[TrainState, Metrics]:
         def update(state: TrainState, drawn: tuple) -> tuple[TrainState, Metrics]:
-            return step(state, frames, *drawn)
+            return step(state, *drawn, frames)
 
         state, metrics = jax.lax.scan(update, state, (batch, expert))
         return state, jax.tree.map(lambda values: values[-1], metrics)

@@ -1,0 +1,133 @@
+"""The learner's updates: their batches drawn, collected, brought to the device, run."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxil import experiment
+from jaxil.config import Config
+from jaxil.experiment import Agent
+from jaxil.host import demonstrations as host_demonstrations
+from jaxil.host.mirror import Mirror
+from jaxil.host.replay import Replay
+from jaxil.learner.gathering import Frames
+from jaxil.learner.state import TrainState
+from jaxil.maths.types import Batch, ExpertBatch, ExpertEpisodes, Metrics, Window
+
+Drawn = tuple[Batch | None, ExpertBatch | None]
+
+
+class Updates:
+    """Draws a batch for each update that is due, and runs so many at once.
+
+    With `replay_on_device`, frames lie on the device and batches name their places;
+    without, batches are stacked on the host and sent whole. Both draw the same ones.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        agent: Agent,
+        replay: Replay,
+        demonstrations: host_demonstrations.Demonstrations | None,
+        experts: ExpertEpisodes | None,
+    ) -> None:
+        """Copies the frames to the device, where they shall lie there.
+
+        Args:
+          config: checked.
+          agent: the compiled steps.
+          replay: filled already, on a resume.
+          demonstrations: what the method imitates, or None.
+          experts: the same on the device, for methods that match whole episodes.
+        """
+        self._config = config
+        self._agent = agent
+        self._replay = replay
+        self._demonstrations = demonstrations
+        self._pending: list[Drawn] = []
+        self._clones = config.method == "bc"
+        self._mirror: Mirror | None = None
+        self._expert_frames: jax.Array | None = None
+        if config.replay_on_device:
+            if not self._clones:
+                self._mirror = Mirror(replay)
+            if experts is not None:
+                self._expert_frames = experts.frames  # no second copy
+            elif demonstrations is not None and self._samples_expert:
+                self._expert_frames = jnp.asarray(demonstrations.frames)
+
+    @property
+    def _samples_expert(self) -> bool:
+        return self._clones or self._agent.rewarder.samples_expert
+
+    def collect(self, rng: np.random.Generator) -> bool:
+        """Draws for one update; says whether there are enough to be run.
+
+        Until they are run, no episode may enter the replay.
+        """
+        self._pending.append(self.draw(rng))
+        return len(self._pending) >= self._config.updates_per_dispatch
+
+    def run(self, state: TrainState) -> tuple[TrainState, Metrics | None]:
+        """Runs what is collected.
+
+        Args:
+          state: donated.
+
+        Returns:
+          The state after it, and metrics of the last update, None without any.
+        """
+        pending, self._pending = self._pending, []
+        frames, metrics = self._frames(), None
+        if len(pending) > 1 and len(pending) == self._config.updates_per_dispatch:
+            batches = jax.tree.map(lambda *leaves: np.stack(leaves), *pending)
+            return self._agent.repeated_step(state, *batches, frames)
+        # Fewer, because an episode or a budget ended: a scan of another length would
+        # have to be compiled.
+        for batch, expert in pending:
+            state, metrics = self._agent.update_step(state, batch, expert, frames)
+        return state, metrics
+
+    def episode_added(self) -> None:
+        """Follows the replay, after an episode has entered it."""
+        if self._mirror is not None:
+            self._mirror.refresh()
+
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        """Draws what one update learns from."""
+        config = self._config
+        batch = expert = None
+        if not self._clones:
+            on_host = self._mirror is None
+            draw = self._replay.sample if on_host else self._replay.sample_indices
+            windows = self._agent.rewarder.relabel is not None
+            drawn = draw(rng, config.batch_size, windows=windows)
+            window = None if drawn.window is None else Window(*drawn.window)
+            batch = Batch(*drawn[:-1], window=window)
+        if self._samples_expert:
+            expert = self._draw_expert(rng)
+        return batch, expert
+
+    def _draw_expert(self, rng: np.random.Generator) -> ExpertBatch:
+        assert self._demonstrations is not None
+        on_host = self._expert_frames is None
+        draw = (
+            host_demonstrations.sample
+            if on_host
+            else host_demonstrations.sample_indices
+        )
+        group = self._config.cloning if self._clones else self._config.discriminator
+        drawn = draw(
+            self._demonstrations,
+            rng,
+            group.batch_size,
+            frame_stack=experiment.stack_size(self._config),
+        )
+        return ExpertBatch(*drawn)
+
+    def _frames(self) -> Frames | None:
+        if not self._config.replay_on_device:
+            return None
+        agent = None if self._mirror is None else self._mirror.frames
+        return Frames(agent, self._expert_frames)

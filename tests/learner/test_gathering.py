@@ -1,0 +1,116 @@
+"""Several updates in one call against as many calls, with and without frames."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxil.learner.gathering import Frames, make_gathering_step, make_repeated_step
+from jaxil.learner.update import make_update_step
+from jaxil.maths.types import Batch, ExpertBatch
+from tests.learner.test_update import (
+    ACTIONS,
+    BATCH,
+    PDAC,
+    SIDE,
+    assert_identical,
+    make_learner,
+    make_state,
+)
+
+NUM_UPDATES, NUM_FRAMES, STACK = 4, 20, 2
+
+
+def make_frames() -> Frames:
+    rng = np.random.default_rng(0)
+    shape = (SIDE, SIDE, 3)
+    return Frames(
+        rng.integers(0, 256, (NUM_FRAMES, *shape), dtype=np.uint8),
+        rng.integers(0, 256, (2, NUM_FRAMES // 2, *shape), dtype=np.uint8),
+    )
+
+
+def draw(seed: int) -> tuple[Batch, ExpertBatch]:
+    rng = np.random.default_rng(seed)
+
+    def places(size: int) -> np.ndarray:
+        return rng.integers(NUM_FRAMES, size=(size, STACK)).astype(np.int32)
+
+    def numbers(*shape: int) -> np.ndarray:
+        return rng.uniform(-1, 1, shape).astype(np.float32)
+
+    batch = Batch(
+        observation=places(BATCH),
+        action=numbers(BATCH, ACTIONS),
+        reward=numbers(BATCH),
+        discount=numbers(BATCH),
+        next_observation=places(BATCH),
+    )
+    return batch, ExpertBatch(places(4), numbers(4, ACTIONS))
+
+
+def on_host(frames: Frames, batch: Batch, expert: ExpertBatch):
+    """Stacks by NumPy's own concatenation."""
+
+    def stacked(row, places):
+        return np.concatenate([row[place] for place in places.T], axis=-1)
+
+    experts = np.asarray(frames.expert).reshape(-1, SIDE, SIDE, 3)
+    return batch._replace(
+        observation=stacked(frames.agent, batch.observation),
+        next_observation=stacked(frames.agent, batch.next_observation),
+    ), expert._replace(observation=stacked(experts, expert.observation))
+
+
+def as_many(*drawn):
+    """Lays batches one behind the other along a new first axis."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *drawn)
+
+
+LEARNER = make_learner(PDAC)
+STEP = make_gathering_step(make_update_step(LEARNER))
+SINGLE = jax.jit(STEP)  # compiled once for all tests, for each form of batches
+
+
+def test_frames_on_the_device_change_no_update():
+    frames, drawn, state = make_frames(), draw(0), make_state(LEARNER)
+    gathered, _ = SINGLE(state, *drawn, frames)
+    sent, _ = SINGLE(state, *on_host(frames, *drawn))
+    assert_identical(gathered, sent)
+
+
+def test_four_updates_in_one_call_are_four_calls():
+    chex.clear_trace_counter()
+    frames, start = make_frames(), make_state(LEARNER)
+    draws = [draw(seed) for seed in range(NUM_UPDATES)]
+    state = start
+    for drawn in draws:
+        state, metrics = SINGLE(state, *drawn, frames)
+    counted = chex.assert_max_traces(make_repeated_step(STEP), n=1)
+    repeated = jax.jit(counted, donate_argnums=0)
+    # Twice from the same start: compiled once, and no call leaves a trace.
+    for _ in range(2):
+        given = jax.tree.map(jnp.copy, start)
+        at_once, at_once_metrics = repeated(given, *as_many(*draws), frames)
+        assert at_once.num_updates == NUM_UPDATES
+        # Equal up to the order of sums, which XLA chooses anew inside a loop.
+        for name in ("params", "target_critic"):
+            ours, theirs = getattr(at_once, name), getattr(state, name)
+            chex.assert_trees_all_close(ours, theirs, atol=1e-5)
+        ours, theirs = at_once.rewarder.params, state.rewarder.params
+        chex.assert_trees_all_close(ours, theirs, atol=1e-5)
+        chex.assert_trees_all_close(at_once_metrics, metrics, rtol=1e-3, atol=1e-5)
+        assert all(leaf.is_deleted() for leaf in jax.tree.leaves(given.params))
+
+
+def test_the_frames_are_not_copied():
+    frames, drawn = make_frames(), draw(0)
+    many = jax.ShapeDtypeStruct((50_000, SIDE, SIDE, 3), np.uint8)  # 22 MB
+    lowered = jax.jit(make_repeated_step(STEP)).lower(
+        jax.eval_shape(lambda: make_state(LEARNER)),
+        *as_many(*[drawn] * NUM_UPDATES),
+        frames._replace(agent=many),
+    )
+    memory = lowered.compile().memory_analysis()
+    assert memory is not None
+    assert memory.temp_size_in_bytes < 10e6
