@@ -1,0 +1,1 @@
+"""What `jaxil.benchmark` is made of: clocks, arithmetic, a run taken apart, tables."""

@@ -1,0 +1,181 @@
+"""All parts of a run, timed and weighed one after the other, then the loop."""
+
+import pathlib
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxil import experiment
+from jaxil.config import Config
+from jaxil.host import replay as host_replay
+from jaxil.timing import arithmetic, compiling, device, start
+from jaxil.timing.bench import Bench, make_bench
+from jaxil.timing.clock import timed
+
+_UPDATE_PARTS = ("encoder", "critic", "actor", "rewarder", "optimiser")
+
+
+def measure(
+    config: Config,
+    *,
+    repeats: int,
+    steps: int,
+    environment: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """Times the parts of a run.
+
+    Args:
+      config: checked.
+      repeats: timings of each part, of which the median counts: ten times as many of
+        the short ones, fewer of the longest.
+      steps: decisions of the loop that are timed.
+      environment: variables of the process in which starting is timed; None leaves
+        that out.
+
+    Returns:
+      What `tables.ROWS` names, None where it does not apply; `ranges`, lowest and
+      highest by name; what it was measured on; the config.
+    """
+    demonstrations = experiment.load_demonstrations(config)
+    with tempfile.TemporaryDirectory() as folder:
+        bench = make_bench(
+            config, pathlib.Path(folder), demonstrations, steps=steps, say=_say
+        )
+        parts, ranges = _time_parts(bench, repeats)
+        results = {**parts, **_time_loop(bench), **_memory(bench)}
+        results |= arithmetic.count(bench, results["update_ms"])
+        results |= _whole_run(config, results, len(bench.episode.actions))
+        # Last of all, because compiling anew forgets what is compiled.
+        cold, warm = compiling.cold_and_warm(bench.lower_update)
+        results |= {"compile_cold_seconds": cold, "compile_warm_seconds": warm}
+        bench.run.outputs.close()
+    results["start_seconds"] = None
+    if environment is not None:
+        results["start_seconds"] = start.seconds_to_first_step(
+            config, environment, _say
+        )
+    return {
+        **results,
+        "ranges": ranges,
+        **device.describe(),
+        "repeats": repeats,
+        "steps": steps,
+        "config": config.to_dict(),
+    }
+
+
+def _time_parts(
+    bench: Bench, repeats: int
+) -> tuple[dict[str, Any], dict[str, tuple[float, float]]]:
+    """Returns medians and ranges in milliseconds, by the names of the table."""
+    run, rng = bench.run, np.random.default_rng(0)
+    draw = run.environment.renderer.render
+    if run.config.observation == "state":
+        draw = run.environment.frame
+    observation = run.environment.reset(episode=0).observation
+    batches = bench.dispatched()
+    on_device, together = jax.device_put(batches), run.config.updates_per_dispatch
+    often, few, rarely = 10 * repeats, max(repeats // 2, 1), max(repeats // 5, 1)
+    functions: dict[str, tuple[Callable[[], Any], int]] = {
+        "physics_ms": (_physics_step(run.config), often),
+        "render_ms": (draw, often),
+        "act_ms": (lambda: run.act(observation), often),
+        "insert_ms": (bench.add_episode, repeats),
+        "sample_ms": (lambda: run.updates.draw(rng), repeats),
+        "transfer_ms": (lambda: jax.device_put(batches), repeats),
+        "update_ms": (lambda: bench.update(on_device), repeats),
+        "reward_ms": (lambda: run.reward(bench.episode), few),
+        "evaluation_ms": (bench.play_evaluation, rarely),
+        "checkpoint_ms": (bench.save, few),
+    }
+    for name, function in bench.update_parts().items():
+        functions[f"update_{name}_ms"] = (function, repeats)
+    parts: dict[str, Any] = {f"update_{name}_ms": None for name in _UPDATE_PARTS}
+    ranges = {}
+    for name, (function, times) in functions.items():
+        # Several updates go to the device together, but numbers are of one.
+        factor = 1e3 / (together if name in ("update_ms", "transfer_ms") else 1)
+        timing = timed(function, times)
+        parts[name] = factor * timing.median
+        ranges[name] = (factor * timing.low, factor * timing.high)
+    parts["compile_seconds"] = bench.first_update_seconds
+    return parts, ranges
+
+
+def _physics_step(config: Config) -> Callable[[], Any]:
+    config = config.copy_and_resolve_references()
+    with config.unlocked():
+        config.observation = "state"  # which draws nothing
+    environment = experiment.training_environment(config)
+    environment.reset(episode=0)
+    action = np.zeros(environment.action_spec().shape)
+    return lambda: environment.step(action)
+
+
+def _time_loop(bench: Bench) -> dict[str, float]:
+    run, stopwatch = bench.run, bench.run.stopwatch
+    before, frames = sum(stopwatch.seconds.values()), run.frame
+    begin = time.perf_counter()
+    run.loop(whole_episodes=False)
+    # The last update may still run in the background: it is an update's time.
+    stopwatch.timed("update", jax.block_until_ready)(run.state.num_updates)
+    wall = time.perf_counter() - begin
+    working = sum(stopwatch.seconds.values()) - before
+    return {
+        "frames_per_second": (run.frame - frames) / wall,
+        "loop_overhead_percent": 100.0 * (wall / working - 1.0),
+    }
+
+
+def _memory(bench: Bench) -> dict[str, float | None]:
+    run, frames, actions = bench.run, bench.episode.frames, bench.episode.actions
+    full = host_replay.memory_bytes(
+        capacity_steps=run.config.replay_size_steps,
+        episode_steps=len(actions),
+        observation_shape=frames.shape[1:],
+        observation_dtype=frames.dtype,
+        action_dim=actions.shape[1],
+    )
+    on_device = device.peak_device_bytes()
+    peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return {
+        "parameters_mb": _megabytes(run.state.params),
+        "learner_state_mb": _megabytes(run.state),
+        "batch_mb": _megabytes(bench.batches),
+        "experts_mb": _megabytes(run.experts),
+        "replay_gb": full / 1e9,
+        "peak_memory_gb": peak / 1e9,
+        "peak_device_memory_gb": None if on_device is None else on_device / 1e9,
+    }
+
+
+def _whole_run(
+    config: Config, results: Mapping[str, Any], episode_steps: int
+) -> dict[str, float]:
+    """Adds up a whole run from its parts: milliseconds for each frame, then hours."""
+    reward = results["reward_ms"] / (episode_steps * config.action_repeat)
+    evaluation = results["evaluation_ms"] * config.num_eval_episodes
+    evaluation /= config.eval_every_frames
+    checkpoint = results["checkpoint_ms"] / config.checkpoint_every_frames
+    loop = 1000.0 / results["frames_per_second"]
+    per_frame = loop + reward + evaluation + checkpoint
+    return {
+        "reward_percent": 100.0 * reward / per_frame,
+        "evaluation_percent": 100.0 * evaluation / per_frame,
+        "run_frames_per_second": 1000.0 / per_frame,
+        "run_hours": config.total_frames * per_frame / 3.6e6,
+    }
+
+
+def _megabytes(tree: Any) -> float:
+    return sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) / 1e6
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
