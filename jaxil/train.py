@@ -118,18 +118,14 @@ class Run:
             TimedEnvironment(self.environment, self.stopwatch),
             self.stopwatch.timed("update", self.act),
             first_episode=counters.num_episodes,
+            meanwhile=self.learn,
         )
         while not self.stop_asked and (
             self.frame < config.total_frames or (whole_episodes and self.decisions)
         ):
-            # Act and observe.
+            # Act; learn; observe.
             decision = next(decisions)
-            counters.num_steps += 1
             self.decisions.append(decision)
-
-            # Learn.
-            if self.update_is_due():
-                self.stopwatch.timed("update", self.update)()
 
             # Reward a finished episode, remember it, look at it.
             if decision.is_last:
@@ -142,6 +138,17 @@ class Run:
                     self.save()
             self.progress.update(self.frame, self.stopwatch.seconds, self.returns)
         self.stopwatch.timed("update", self.flush)()
+
+    def learn(self) -> None:
+        """Counts a decision and starts the learner's step, where one is due.
+
+        Between the action and its observation: jax only starts the update here, which
+        then computes while the simulator does. The next action waits for it, so that
+        the policy never lags.
+        """
+        self.counters.num_steps += 1
+        if self.update_is_due():
+            self.stopwatch.timed("update", self.update)()
 
     def clone(self) -> None:
         """Trains on the demonstrations alone, without playing.

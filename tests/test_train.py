@@ -102,6 +102,20 @@ def test_events_come_in_the_order_of_the_method():
     ]
 
 
+def test_an_update_is_started_before_the_step_that_it_shares_its_time_with():
+    run = TapeRun(_config())
+    step = run.environment.step
+
+    def taped_step(action):
+        run.tape.append("step")
+        return step(action)
+
+    run.environment.step = taped_step
+    run.loop()
+    acted = run.tape.index("act 10")
+    assert run.tape[acted : acted + 3] == ["act 10", "update", "step"]
+
+
 def test_nothing_is_due_by_coincidence_only():
     # 10 frames never meet an episode end (multiples of 6); a modulo would never fire.
     run = TapeRun(_config(eval_every_frames=10, total_frames=36))

@@ -30,7 +30,13 @@ class Decision(NamedTuple):
     episode: int
 
 
-def interact(environment: Any, act: Act, *, first_episode: int) -> Iterator[Decision]:
+def interact(
+    environment: Any,
+    act: Act,
+    *,
+    first_episode: int,
+    meanwhile: Callable[[], None] = lambda: None,
+) -> Iterator[Decision]:
     """Yields decisions without end, episode after episode.
 
     Episode i starts from the state that `environment.reset(episode=i)` gives, so a
@@ -41,6 +47,8 @@ def interact(environment: Any, act: Act, *, first_episode: int) -> Iterator[Deci
         `step(action)` and `single_observation()`.
       act: the policy.
       first_episode: number of the first episode.
+      meanwhile: called between a decision's action and its step: what it starts on a
+        device goes on while the simulator steps and draws.
     """
     episode = first_episode
     while True:
@@ -48,6 +56,7 @@ def interact(environment: Any, act: Act, *, first_episode: int) -> Iterator[Deci
         first_frame = environment.single_observation()
         while not timestep.last():
             action = np.asarray(act(timestep.observation), np.float32)
+            meanwhile()
             timestep = environment.step(action)
             yield Decision(
                 frame=environment.single_observation(),
