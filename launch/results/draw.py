@@ -72,8 +72,11 @@ def _label(config: dict) -> str:
     parts = [
         _NAMES[config["method"]],
         f"repeat {config['action_repeat']}",
+        f"replay {config['replay_size_steps'] // 1000}k",
         f"seed {config['seed']}",
     ]
+    if config["render_quality"] == "smooth":
+        parts.append("smooth")
     penalty = config["discriminator"]["gradient_penalty"]
     if penalty != _PENALTY:
         parts.append(f"penalty {penalty:g}")
