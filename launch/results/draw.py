@@ -27,7 +27,7 @@ def main() -> None:
         config = json.loads((path.parent / "config.json").read_text())["config"]
         runs.setdefault(config["task"], []).append((config, read_csv(path)))
     rows = -(-len(runs) // _COLUMNS)
-    size = (5.2 * _COLUMNS, 4.6 * rows)
+    size = (5.2 * _COLUMNS, 5.2 * rows)
     figure = Figure(figsize=size, dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
@@ -60,9 +60,9 @@ def main() -> None:
         axes.legend(
             loc="upper center",
             bbox_to_anchor=(0.5, -0.16),
-            ncols=2,
+            ncols=1,  # two would reach into the next panel
             frameon=False,
-            fontsize=8,
+            fontsize=7,
         )
     panels[0].set_ylabel("task return, mean of 10 episodes")
     figure.savefig(_HERE / "learning.png")
