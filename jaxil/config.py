@@ -147,13 +147,24 @@ def memory_bytes(config: Config) -> int:
 
     For pixels only; state vectors are small.
     """
-    return replay.memory_bytes(
-        capacity_steps=config.replay_size_steps,
-        episode_steps=max(1000 // config.action_repeat, 1),
-        observation_shape=(config.image_size, config.image_size, 3),
-        observation_dtype="uint8",
-        action_dim=8,
-    )
+    return replay.memory_bytes(**_ring_sizes(config), action_dim=8)
+
+
+def device_memory_bytes(config: Config) -> int:
+    """Returns what the copy of the replay's frames takes on jax's device, in bytes.
+
+    It is reserved at the start; 0 unless `replay_on_device`. For pixels only.
+    """
+    return replay.frames_bytes(**_ring_sizes(config)) if config.replay_on_device else 0
+
+
+def _ring_sizes(config: Config) -> dict[str, Any]:
+    return {
+        "capacity_steps": config.replay_size_steps,
+        "episode_steps": max(1000 // config.action_repeat, 1),
+        "observation_shape": (config.image_size, config.image_size, 3),
+        "observation_dtype": "uint8",
+    }
 
 
 def problems(config: Config, known_tasks: tuple[str, ...]) -> list[str]:

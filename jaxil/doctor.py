@@ -174,9 +174,9 @@ def memory(config: Any) -> Iterator[Finding]:
     if config is None or config.observation != "pixels":  # states take little
         yield Finding("ok", "memory", f"{available / 1e9:.1f} GB available")
         return
-    from jaxil import config as jaxil_config
+    from jaxil import machine
 
-    needed = jaxil_config.memory_bytes(config)
+    needed = machine.host_memory_bytes(config)
     value = (
         f"{available / 1e9:.1f} GB available, {needed / 1e9:.2f} GB for the replay of "
         f"{config.replay_size_steps} steps"
@@ -190,6 +190,26 @@ def memory(config: Any) -> Iterator[Finding]:
         yield Finding("warning", "memory", f"{value}: tight", shrink)
     else:
         yield Finding("ok", "memory", value)
+    yield from _device_memory(config)
+
+
+def _device_memory(config: Any) -> Iterator[Finding]:
+    """Compares a device's memory with the copy of the replay's frames on it."""
+    from jaxil import config as jaxil_config
+    from jaxil import machine
+
+    needed, free = jaxil_config.device_memory_bytes(config), machine.free_device_bytes()
+    if not needed or free is None:  # a CPU's copy is counted with the replay
+        return
+    value = (
+        f"{free / 1e9:.1f} GB free on {machine.device_name()}, {needed / 1e9:.2f} GB "
+        "for the copy of the replay"
+    )
+    fits = needed + _DEVICE_MARGIN <= free
+    advice = "--config.replay_on_device=False, or a smaller replay_size_steps"
+    yield Finding(
+        "ok" if fits else "fault", "device memory", value, "" if fits else advice
+    )
 
 
 def demonstrations(config: Any) -> Iterator[Finding]:

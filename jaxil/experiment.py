@@ -239,6 +239,7 @@ def make_networks(config: Config, action_dim: int, mean: Any) -> AgentNetworks:
         strides=tuple(config.encoder.strides),
         contrast=config.encoder.contrast,
         mean=mean,
+        compute_dtype=config.compute_dtype,
     )
 
 

@@ -69,9 +69,25 @@ def memory_bytes(
       observation_dtype: dtype of a frame.
       action_dim: A.
     """
+    frames = frames_bytes(
+        capacity_steps=capacity_steps,
+        episode_steps=episode_steps,
+        observation_shape=observation_shape,
+        observation_dtype=observation_dtype,
+    )
+    return frames + _num_slots(capacity_steps, episode_steps) * 4 * (action_dim + 2)
+
+
+def frames_bytes(
+    *,
+    capacity_steps: int,
+    episode_steps: int,
+    observation_shape: tuple[int, ...],
+    observation_dtype,
+) -> int:
+    """Says how much of `memory_bytes` is frames, of which a device may hold a copy."""
     frame_bytes = math.prod(observation_shape) * np.dtype(observation_dtype).itemsize
-    other_bytes = 4 * (action_dim + 2)
-    return _num_slots(capacity_steps, episode_steps) * (frame_bytes + other_bytes)
+    return _num_slots(capacity_steps, episode_steps) * frame_bytes
 
 
 def _num_slots(capacity_steps: int, episode_steps: int) -> int:

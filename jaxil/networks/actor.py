@@ -1,6 +1,9 @@
 """The policy network."""
 
+from typing import Any
+
 import flax.linen as nn
+import jax.numpy as jnp
 from jax import Array
 
 from jaxil.networks.layers import MLP, Trunk
@@ -13,6 +16,7 @@ class Actor(nn.Module):
       action_dim: A.
       feature_dim: D, size of the trunk's output.
       hidden_dim: width of the MLP.
+      dtype: see `Trunk`.
 
     Source: facebookresearch/drqv2, drqv2.py, `Actor`.
     """
@@ -20,9 +24,10 @@ class Actor(nn.Module):
     action_dim: int
     feature_dim: int
     hidden_dim: int
+    dtype: Any = jnp.float32
 
     def setup(self) -> None:
-        self.trunk = Trunk(self.feature_dim)
+        self.trunk = Trunk(self.feature_dim, self.dtype)
         self.head = MLP(self.hidden_dim, self.action_dim)
 
     def __call__(self, representation: Array) -> Array:

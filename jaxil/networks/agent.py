@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 from jax import Array
 
 from jaxil.maths.types import Params
@@ -29,6 +30,7 @@ def make_agent_networks(
     strides: tuple[int, ...],
     contrast: float,
     mean: Any,
+    compute_dtype: str = "float32",
 ) -> AgentNetworks:
     """Returns the networks of DrQ-v2.
 
@@ -42,15 +44,18 @@ def make_agent_networks(
       strides: see `PixelEncoder`.
       contrast: see `PixelEncoder`.
       mean: see `PixelEncoder`.
+      compute_dtype: "float32" or "bfloat16", of the convolutions and of the product
+        that follows them.
     """
+    dtype = jnp.dtype(compute_dtype)
     if observation == "state":
         encoder = StateEncoder(hidden_dim)
     else:
-        encoder = PixelEncoder(channels, kernel_sizes, strides, contrast, mean)
+        encoder = PixelEncoder(channels, kernel_sizes, strides, contrast, mean, dtype)
     return AgentNetworks(
         encoder=encoder,
-        actor=Actor(action_dim, feature_dim, hidden_dim),
-        critic=Critic(feature_dim, hidden_dim),
+        actor=Actor(action_dim, feature_dim, hidden_dim, dtype),
+        critic=Critic(feature_dim, hidden_dim, dtype),
     )
 
 

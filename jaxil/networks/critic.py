@@ -1,5 +1,7 @@
 """Twin Q-functions on one trunk."""
 
+from typing import Any
+
 import chex
 import flax.linen as nn
 import jax.numpy as jnp
@@ -14,15 +16,17 @@ class Critic(nn.Module):
     Attributes:
       feature_dim: D, size of the trunk's output.
       hidden_dim: width of both MLPs.
+      dtype: see `Trunk`.
 
     Source: facebookresearch/drqv2, drqv2.py, `Critic`.
     """
 
     feature_dim: int
     hidden_dim: int
+    dtype: Any = jnp.float32
 
     def setup(self) -> None:
-        self.trunk = Trunk(self.feature_dim)
+        self.trunk = Trunk(self.feature_dim, self.dtype)
         self.value_1 = MLP(self.hidden_dim, 1)
         self.value_2 = MLP(self.hidden_dim, 1)
 

@@ -24,6 +24,7 @@ class PixelEncoder(nn.Module):
       contrast: factor on the centred pixels; 1 in the paper.
       mean: what is subtracted, in [0, 1]: 0.5 in the paper, or an image
         [H, W, C] as nested tuples or an array.
+      dtype: of the convolutions; parameters are float32 whatever it is.
 
     Source: facebookresearch/drqv2, drqv2.py, `Encoder`.
     """
@@ -33,10 +34,11 @@ class PixelEncoder(nn.Module):
     strides: tuple[int, ...] = (2, 1, 1, 1)
     contrast: float = 1.0
     mean: Any = 0.5
+    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, observation: Array) -> Array:
-        """Maps uint8 [B, H, W, C] to float32 [B, R]."""
+        """Maps uint8 [B, H, W, C] to [B, R] of `dtype`."""
         chex.assert_rank(observation, 4)
         x = observation.astype(jnp.float32) / 255.0
         mean = jnp.asarray(self.mean, jnp.float32)
@@ -49,6 +51,7 @@ class PixelEncoder(nn.Module):
                 strides=(stride, stride),
                 padding="VALID",
                 kernel_init=nn.initializers.orthogonal(scale=math.sqrt(2.0)),
+                dtype=self.dtype,
                 conv_general_dilated=convolution.convolve,
             )(x)
             x = nn.relu(x)

@@ -1,5 +1,7 @@
 """Building blocks that several networks share."""
 
+from typing import Any
+
 import chex
 import flax.linen as nn
 import jax.numpy as jnp
@@ -8,12 +10,21 @@ from jax import Array
 _LAYER_NORM_EPSILON = 1e-5  # PyTorch's default; flax's own is 1e-6
 
 
-def dense(features: int, name: str | None = None) -> nn.Dense:
+def dense(
+    features: int, name: str | None = None, dtype: Any = jnp.float32
+) -> nn.Dense:
     """Returns a linear layer, orthogonal with gain 1 and bias 0.
+
+    Args:
+      features: size of the output.
+      name: of its parameters.
+      dtype: of the product; parameters are float32 whatever it is.
 
     Source: facebookresearch/drqv2, utils.py, `weight_init`.
     """
-    return nn.Dense(features, kernel_init=nn.initializers.orthogonal(), name=name)
+    return nn.Dense(
+        features, kernel_init=nn.initializers.orthogonal(), name=name, dtype=dtype
+    )
 
 
 class Trunk(nn.Module):
@@ -23,17 +34,20 @@ class Trunk(nn.Module):
 
     Attributes:
       feature_dim: D, number of features.
+      dtype: of the product W x, the learner's largest; the rest is float32.
 
     Source: facebookresearch/drqv2, drqv2.py, `Actor.trunk`, `Critic.trunk`.
     """
 
     feature_dim: int
+    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, representation: Array) -> Array:
-        """Maps [B, R] to [B, D], in [-1, 1]."""
+        """Maps [B, R] to float32 [B, D], in [-1, 1]."""
         chex.assert_rank(representation, 2)
-        x = dense(self.feature_dim, name="project")(representation)
+        project = dense(self.feature_dim, name="project", dtype=self.dtype)
+        x = project(representation).astype(jnp.float32)
         x = nn.LayerNorm(epsilon=_LAYER_NORM_EPSILON, name="normalise")(x)
         return jnp.tanh(x)
 
