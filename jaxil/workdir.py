@@ -8,10 +8,8 @@ import pathlib
 from collections.abc import Iterator
 from typing import Any
 
-import ml_collections
-
 from jaxil.command import UsageError
-from jaxil.config import Config
+from jaxil.config import Config, default_config
 
 # A run may be prolonged without becoming another run.
 _FREE_FIELDS = ("total_frames",)
@@ -77,12 +75,18 @@ def opened(workdir: pathlib.Path) -> Iterator[None]:
 def read_config(workdir: pathlib.Path) -> Config:
     """Returns the config of the run in a folder.
 
+    Fields that did not exist when it was written have their defaults: these are what
+    was done before there was a choice.
+
     Raises:
       UsageError: there is none, or it can't be read.
     """
     path = workdir / "config.json"
     try:
-        return ml_collections.ConfigDict(json.loads(path.read_text())["config"])
+        stored = json.loads(path.read_text())["config"]
+        config = default_config(stored["method"], stored["task"])
+        config.update(stored)
+        return config
     except OSError as error:
         raise UsageError(
             f"workdir={str(workdir)!r} holds no run: {path} can't be read "
