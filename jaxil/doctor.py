@@ -33,6 +33,7 @@ _VERSIONS: dict[str, tuple[tuple[int, ...], tuple[int, ...], str]] = {
 _MEASURE_SECONDS = 1.0
 _SLOW_FRAME_MS = 8.0
 _MEMORY_MARGIN = 1.5e9  # jax, the learner, the simulators
+_DEVICE_MARGIN = 3e9  # the learner and what an update of 256 images leaves behind
 _NUM_TRIED_STATES = 3
 
 
@@ -174,12 +175,14 @@ def memory(config: Any) -> Iterator[Finding]:
     if config is None or config.observation != "pixels":  # states take little
         yield Finding("ok", "memory", f"{available / 1e9:.1f} GB available")
         return
+    from jaxil import config as jaxil_config
     from jaxil import machine
 
     needed = machine.host_memory_bytes(config)
     value = (
         f"{available / 1e9:.1f} GB available, {needed / 1e9:.2f} GB for the replay of "
         f"{config.replay_size_steps} steps"
+        f"{' and its copy' if needed > jaxil_config.memory_bytes(config) else ''}"
     )
     room = max(available - _MEMORY_MARGIN, 0.0)
     fitting = int(config.replay_size_steps * room / needed) // 1000 * 1000

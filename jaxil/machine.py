@@ -71,14 +71,14 @@ def memory_sentence(config: Config) -> str:
     """Says what the replay will take, before it is allocated."""
     if config.observation != "pixels":
         return "replay of state vectors: small"
-    needed = host_memory_bytes(config)
+    needed, stored = host_memory_bytes(config), jaxil_config.memory_bytes(config)
     text = (
         f"replay: {config.replay_size_steps} steps of {config.image_size}x"
-        f"{config.image_size} pixels take {needed / 1e9:.2f} GB when full"
+        f"{config.image_size} pixels take {stored / 1e9:.2f} GB when full"
     )
     copied = jaxil_config.device_memory_bytes(config)
     if copied:
-        text += f", its copy on {device_name()} {copied / 1e9:.2f} GB"
+        text += f", its frames on {device_name()} another {copied / 1e9:.2f} GB"
     free = platform.available_memory_bytes()
     if free is not None and needed + _BESIDE_THE_REPLAY > free:
         text += (

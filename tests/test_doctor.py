@@ -6,7 +6,7 @@ import os
 import pytest
 
 from jaxil import config as jaxil_config
-from jaxil import doctor, platform
+from jaxil import doctor, machine, platform
 from jaxil.command import UsageError
 from jaxil.host import environment as environments
 from jaxil.host import states
@@ -168,6 +168,27 @@ def test_states_take_little_memory(monkeypatch, config):
     monkeypatch.setattr(platform, "available_memory_bytes", lambda: int(1e9))
     config.observation = "state"
     assert one(doctor.memory(config), "memory").level == "ok"
+
+
+def test_a_copy_on_the_device_is_counted_where_it_lies(monkeypatch, config):
+    plain = jaxil_config.memory_bytes(config)
+    config.replay_on_device = True
+    frames = jaxil_config.device_memory_bytes(config)
+    # 150000 steps in 300 episodes of 500: one frame more in each.
+    assert frames == 150_300 * 48 * 48 * 3
+    monkeypatch.setattr(platform, "available_memory_bytes", lambda: int(plain + 2e9))
+    monkeypatch.setattr(machine, "device_name", lambda: "cpu: cpu")
+    monkeypatch.setattr(machine, "free_device_bytes", lambda: None)
+    assert one(doctor.memory(config), "memory").level == "warning"  # there twice
+    assert "another 1.04 GB" in machine.memory_sentence(config)
+    monkeypatch.setattr(machine, "device_name", lambda: "gpu: NVIDIA H100")
+    for free, level in ((1e9, "fault"), (10e9, "ok")):
+        monkeypatch.setattr(machine, "free_device_bytes", lambda free=free: int(free))
+        found = list(doctor.memory(config))
+        assert one(found, "memory").level == "ok"
+        assert one(found, "device memory").level == level
+        assert "NVIDIA H100" in one(found, "device memory").value
+    assert "gpu: NVIDIA H100" in machine.memory_sentence(config)
 
 
 def test_the_advised_replay_fits(monkeypatch, config):

@@ -10,9 +10,7 @@ from jax import Array
 _LAYER_NORM_EPSILON = 1e-5  # PyTorch's default; flax's own is 1e-6
 
 
-def dense(
-    features: int, name: str | None = None, dtype: Any = jnp.float32
-) -> nn.Dense:
+def dense(features: int, name: str | None = None, dtype: Any = jnp.float32) -> nn.Dense:
     """Returns a linear layer, orthogonal with gain 1 and bias 0.
 
     Args:

@@ -137,3 +137,28 @@ def test_a_state_vectors_scale_reaches_the_trunk():
 def test_an_image_without_batch_is_rejected():
     with pytest.raises(AssertionError):
         TINY.init(jax.random.key(0), random_images()[0])
+
+
+def test_bfloat16_computes_in_halves_and_keeps_float32():
+    images = random_images()
+    half = PixelEncoder((4, 4), (3, 3), (2, 1), dtype=jnp.bfloat16)
+    params = half.init(jax.random.key(0), images)
+    assert {leaf.dtype for leaf in jax.tree.leaves(params)} == {jnp.dtype("float32")}
+    features, expected = apply(half, params, images), apply(TINY, params, images)
+    assert features.dtype == jnp.bfloat16
+    # Eight bits of mantissa, through two layers; some rounding must show.
+    error = np.abs(np.asarray(features, np.float32) - expected)
+    assert 0.0 < error.max() < 0.03 * np.abs(expected).max()
+    trunk = Trunk(8, jnp.bfloat16)
+    trunk_params = trunk.init(jax.random.key(1), features)
+    squeezed = apply(trunk, trunk_params, features)
+    assert squeezed.dtype == jnp.float32
+    plain = apply(Trunk(8), trunk_params, expected)
+    assert 0.0 < np.abs(squeezed - plain).max() < 0.1
+    gradient = jax.grad(lambda p: apply(half, p, images).astype(jnp.float32).sum())
+    exact = jax.grad(lambda p: apply(TINY, p, images).sum())
+    for ours, theirs in zip(
+        jax.tree.leaves(gradient(params)), jax.tree.leaves(exact(params)), strict=True
+    ):
+        assert ours.dtype == jnp.float32
+        assert np.abs(ours - theirs).max() < 0.05 * np.abs(theirs).max()
