@@ -5,8 +5,9 @@ r"""Times and weighs every part of a run on this machine, and the loop that join
     python -m jaxil.benchmark --config=configs/pdac_walker.py \
         --sweep=batch_size:64,128,256 --json=batch_sizes.json
 
-Medians over repeats, after a warm-up; nothing is learned and nothing kept. Starting is
-timed in a process of its own; --nostart leaves it out.
+Medians over repeats, after a warm-up; nothing is learned and nothing kept. Compiling
+without a cache, and starting a run, in a process of its own, are timed last; --nostart
+leaves both out, as a sweep does.
 """
 
 import json
@@ -109,7 +110,7 @@ def _define(values: flags.FlagValues) -> None:
     flags.DEFINE_boolean(
         "start",
         True,
-        "time the start of a run too, in a process of its own",
+        "time compiling without a cache and starting a run too",
         flag_values=values,
     )
     flags.DEFINE_integer(

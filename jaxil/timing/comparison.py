@@ -9,7 +9,7 @@ from jaxil.command import UsageError
 from jaxil.timing.tables import ROWS
 
 # Whatever jaxil wrote the file, old or new, it has these.
-_ALWAYS = ("update_ms", "device", "config")
+_ALWAYS = {"update_ms": int | float, "device": str, "config": dict}
 _CIRCUMSTANCES = ("device", "num_devices", "processor", "usable_cores", "machine")
 
 
@@ -30,7 +30,8 @@ def read(path: str) -> dict[str, Any]:
         raise UsageError(f"--compare={path} is not JSON ({error}): {hint}") from error
     if isinstance(results, list):
         raise UsageError(f"--compare={path} is a sweep's: {hint}, without --sweep")
-    missing = [n for n in _ALWAYS if not isinstance(results, dict) or n not in results]
+    fields = results if isinstance(results, dict) else {}
+    missing = [n for n, kind in _ALWAYS.items() if not isinstance(fields.get(n), kind)]
     if missing:
         raise UsageError(
             f"--compare={path} holds no results (it lacks {', '.join(missing)}): {hint}"

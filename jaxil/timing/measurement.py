@@ -36,7 +36,7 @@ def measure(
         the short ones, fewer of the longest.
       steps: decisions of the loop that are timed.
       environment: variables of the process in which starting is timed; None leaves
-        that out.
+        that out, and compiling without a cache.
 
     Returns:
       What `tables.ROWS` names, None where it does not apply; `ranges`, lowest and
@@ -51,15 +51,8 @@ def measure(
         results = {**parts, **_time_loop(bench), **_memory(bench)}
         results |= arithmetic.count(bench, results["update_ms"])
         results |= _whole_run(config, results, len(bench.episode.actions))
-        # Last of all, because compiling anew forgets what is compiled.
-        cold, warm = compiling.cold_and_warm(bench.lower_update)
-        results |= {"compile_cold_seconds": cold, "compile_warm_seconds": warm}
+        results |= _before_the_first_step(config, bench, environment)
         bench.run.outputs.close()
-    results["start_seconds"] = None
-    if environment is not None:
-        results["start_seconds"] = start.seconds_to_first_step(
-            config, environment, _say
-        )
     return {
         **results,
         "ranges": ranges,
@@ -131,6 +124,17 @@ def _time_loop(bench: Bench) -> dict[str, float]:
         "frames_per_second": (run.frame - frames) / wall,
         "loop_overhead_percent": 100.0 * (wall / working - 1.0),
     }
+
+
+def _before_the_first_step(
+    config: Config, bench: Bench, environment: Mapping[str, str] | None
+) -> dict[str, float | None]:
+    """Times what people wait for. Compiling anew forgets all that is compiled."""
+    names = ("start_seconds", "compile_cold_seconds", "compile_warm_seconds")
+    if environment is None:
+        return dict.fromkeys(names)
+    started = start.seconds_to_first_step(config, environment, _say)
+    return dict(zip(names, (started, *compiling.cold_and_warm(bench.lower_update))))
 
 
 def _memory(bench: Bench) -> dict[str, float | None]:

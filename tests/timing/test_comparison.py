@@ -1,0 +1,77 @@
+"""Which files can be compared, what is compared, and what is said to differ."""
+
+import json
+
+import pytest
+
+from jaxil.command import UsageError
+from jaxil.timing import comparison, tables
+
+_OLD = {
+    "update_ms": 10.0,
+    "sample_ms": None,
+    "render_ms": 0.0,
+    "device": "cpu: cpu",
+    "config": {"batch_size": 8, "encoder": {"strides": (4, 1)}},
+}
+
+
+def test_only_numbers_that_both_have_are_compared():
+    new = {**_OLD, "update_ms": 15.0, "sample_ms": 1.0, "act_ms": 2.0}
+    found = comparison.pairs(_OLD, new)
+    assert found == {"update_ms": (10.0, 15.0), "render_ms": (0.0, 0.0)}
+    rows = [line.split() for line in tables.comparison_table(found).splitlines()]
+    assert ["update_ms", "10.00", "15.00", "1.50"] in rows
+
+
+def test_a_ratio_to_nothing_is_left_out():
+    text = tables.comparison_table({"render_ms": (0.0, 3.0)})
+    assert text.splitlines()[1].split() == ["render_ms", "0.00", "3.00"]
+
+
+def test_the_same_settings_differ_in_nothing():
+    # Through a file, tuples become lists: no difference.
+    assert comparison.differences(json.loads(json.dumps(_OLD)), _OLD) == []
+
+
+def test_other_devices_and_fields_are_named():
+    config = {"batch_size": 16, "encoder": {"strides": (2, 1)}, "seed": 1}
+    new = {**_OLD, "device": "gpu: H100", "config": config}
+    assert comparison.differences(_OLD, new) == [
+        "device: 'cpu: cpu' then, 'gpu: H100' now",
+        "config.batch_size: 8 then, 16 now",
+        "config.encoder.strides: [4, 1] then, [2, 1] now",
+        "config.seed: absent then, 1 now",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("{", "is not JSON"),
+        ("[]", "is a sweep's"),
+        ("3", "lacks update_ms, device, config"),
+        ('{"update_ms": 3, "device": "cpu"}', "lacks config"),
+        ('{"update_ms": "fast", "device": "cpu", "config": {}}', "lacks update_ms"),
+        ('{"update_ms": 3, "device": "cpu", "config": 3}', "lacks config"),
+        (b"\xff\xfe\x00", "is not JSON"),
+        (None, "can't be read (No such file or directory)"),
+    ],
+)
+def test_files_without_results_are_refused(content, expected, tmp_path):
+    path = tmp_path / "old.json"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        path.write_text(content)
+    with pytest.raises(UsageError) as caught:
+        comparison.read(str(path))
+    assert str(path) in str(caught.value)
+    assert expected in str(caught.value)
+    assert "--json=FILE" in str(caught.value)
+
+
+def test_results_come_back_from_a_file(tmp_path):
+    path = tmp_path / "old.json"
+    path.write_text(json.dumps(_OLD))
+    assert comparison.read(str(path))["update_ms"] == 10.0
