@@ -99,6 +99,10 @@ def make_gathering_step(step: Step) -> Step:
             batch = gather_batch(frames.agent, batch)
         if frames is not None and expert is not None:
             expert = gather_expert(frames.expert, expert)
+        if frames is not None:
+            # Without it, XLA may fuse what follows with the gathering, sum in another
+            # order, and where frames lie would change the numbers of a run.
+            batch, expert = jax.lax.optimization_barrier((batch, expert))
         return step(state, batch, expert)
 
     return gathering_step
