@@ -221,3 +221,11 @@ class Reading:
 
 def _compilations(step: Any) -> int:
     return step._cache_size()
+
+
+def test_settings_of_speed_are_checked_at_the_door():
+    config = make_config("pdac", updates_per_dispatch=0, compute_dtype="float16")
+    faults = jaxil_config.problems(config, ("walker_walk",))
+    assert len(faults) == 2
+    assert "compute_dtype='float16' is unknown; choose one of: float32" in faults[0]
+    assert "updates_per_dispatch=0 must lie in [1, 1000]" in faults[1]
