@@ -224,7 +224,8 @@ def _compilations(step: Any) -> int:
 
 
 def test_settings_of_speed_are_checked_at_the_door():
-    config = make_config("pdac", updates_per_dispatch=0, compute_dtype="float16")
+    config = jaxil_config.default_config("pdac", "walker_walk")
+    config.update(updates_per_dispatch=0, compute_dtype="float16")
     faults = jaxil_config.problems(config, ("walker_walk",))
     assert len(faults) == 2
     assert "compute_dtype='float16' is unknown; choose one of: float32" in faults[0]
