@@ -165,7 +165,7 @@ class Outputs:
         folder = self._workdir / "videos"
         folder.mkdir(exist_ok=True)
         packed = io.BytesIO()
-        np.savez_compressed(packed, **filmed)
+        np.savez_compressed(packed, **filmed)  # pyright: ignore[reportArgumentType]
         host_metrics.write_atomically(
             folder / f"frame_{frame:09d}.npz", packed.getvalue()
         )

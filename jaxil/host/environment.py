@@ -145,10 +145,10 @@ class Renderer:
             # The camera hands out its one buffer, overwritten by the next image.
             return image.copy()
         n = self._factor
-        corners = [
-            image[i::n, j::n].astype(np.uint16) for i in range(n) for j in range(n)
-        ]
-        return ((sum(corners) + n * n // 2) // (n * n)).astype(np.uint8)
+        total = np.full((self.image_size, self.image_size, 3), n * n // 2, np.uint16)
+        for i, j in np.ndindex(n, n):
+            total += image[i::n, j::n]
+        return (total // (n * n)).astype(np.uint8)
 
     def gl_name(self) -> str:
         """Returns what GL calls the device that draws, such as "llvmpipe (...)"."""

@@ -44,6 +44,12 @@ def make_rewarder():
     return rewarder._replace(update=jax.jit(rewarder.update))
 
 
+def relabel(state, window):
+    rewarder = make_rewarder()
+    assert rewarder.relabel is not None
+    return rewarder.relabel(state, NOBODY, window)
+
+
 def draw(seed, count, low=0, high=256, shape=SHAPE):
     rng = np.random.default_rng(seed)
     pixels = rng.integers(low, high, (count, *shape), dtype=np.uint8)
@@ -84,8 +90,7 @@ def test_expert_above_zero_above_agent_after_learning(told_by):
         metrics["discriminator/expert_logit"] > 0 > metrics["discriminator/agent_logit"]
     )
     relabelled = [
-        make_rewarder().relabel(state, NOBODY, Window(o[:, None], a[:, None], None))
-        for o, a in (expert, agent)
+        relabel(state, Window(o[:, None], a[:, None], None)) for o, a in (expert, agent)
     ]
     assert np.mean(relabelled[0]) > 0.1
     assert np.mean(relabelled[1]) < -0.1
@@ -121,10 +126,8 @@ def test_a_window_is_rewarded_as_its_transitions_are():
     window = Window(
         pixels.reshape(2, 3, *SHAPE), actions.reshape(2, 3, 2), np.ones((2, 3))
     )
-    together = rewarder.relabel(state, NOBODY, window)
-    single = rewarder.relabel(
-        state, NOBODY, Window(pixels[:, None], actions[:, None], None)
-    )
+    together = relabel(state, window)
+    single = relabel(state, Window(pixels[:, None], actions[:, None], None))
     assert together.shape == (2, 3)
     np.testing.assert_allclose(together.reshape(-1, 1), single, rtol=1e-4, atol=1e-5)
 

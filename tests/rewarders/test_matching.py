@@ -16,7 +16,7 @@ def matching(cost="euclidean", alignment="time"):
 
 
 def draw(seed, *shape):
-    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+    return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
 
 
 def test_euclidean_cost_is_scipys():

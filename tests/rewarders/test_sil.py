@@ -44,9 +44,7 @@ def make_rewarder():
         frame_stack=1,
     )
     return rewarder._replace(
-        update=jax.jit(rewarder.update),
-        rewards=jax.jit(rewarder.rewards),
-        plan=jax.jit(rewarder.plan),
+        update=jax.jit(rewarder.update), rewards=jax.jit(rewarder.rewards)
     )
 
 
@@ -71,7 +69,9 @@ def start():
 
 def climb(state, agent, expert, steps):
     poison = jnp.full(agent.shape, jnp.nan)
-    view = AgentView(poison, jnp.full((BATCH, 5), jnp.nan), np.zeros((BATCH, 2)), agent)
+    view = AgentView(
+        poison, jnp.full((BATCH, 5), jnp.nan), jnp.zeros((BATCH, 2)), agent
+    )
     distances = []
     for _ in range(steps):
         state, metrics = make_rewarder().update(
@@ -112,15 +112,14 @@ def test_the_gradient_is_that_of_the_distance():
     # Of the regularised distance: the entropy counts too, so the two are compared in
     # direction, where epsilon is small.
     rng = np.random.default_rng(0)
-    agent, expert = (rng.normal(size=(6, 4)).astype(np.float32) for _ in range(2))
+    agent, expert = jnp.asarray(rng.normal(size=(2, 6, 4)), jnp.float32)
     tight = make_matching(
         cost="cosine", alignment="transport", epsilon=0.005, num_iterations=2000
     )
     gradient = jax.grad(lambda x: batch_distance(tight, x, expert))(agent)
-    numeric = np.zeros_like(agent)
+    numeric = np.zeros(agent.shape)
     for index in np.ndindex(*agent.shape):
-        step = np.zeros_like(agent)
-        step[index] = 1e-2
+        step = jnp.zeros_like(agent).at[index].set(1e-2)
         up, down = (batch_distance(tight, agent + s, expert) for s in (step, -step))
         numeric[index] = (up - down) / 2e-2
     cosine = np.sum(gradient * numeric) / (
@@ -145,8 +144,8 @@ def test_the_first_episode_returns_minus_ten_and_the_scale_stays():
 
 def test_the_plan_matches_a_demonstration_with_itself():
     experts = make_experts()
-    plan = make_rewarder().plan(
-        start(), NOBODY, make_episode(experts.frames[1]), experts
-    )
+    make_plan = make_rewarder().plan
+    assert make_plan is not None
+    plan = make_plan(start(), NOBODY, make_episode(experts.frames[1]), experts)
     assert plan.shape == (STEPS + 1, STEPS + 1)
     assert np.all(np.argmax(plan, axis=1) == np.arange(STEPS + 1))
