@@ -133,7 +133,7 @@ def test_software_beside_a_device_is_warned_of(
 
 
 def test_slow_frames_are_warned_of_where_they_are_used(monkeypatch, config):
-    times = {"paper": 25.0, "fast": 1.5}
+    times = {"paper": 25.0, "fast": 1.5, "smooth": 2.5}
     monkeypatch.setattr(
         doctor, "_frame_milliseconds", lambda task, size, q: ("GPU", times[q])
     )

@@ -120,8 +120,7 @@ def test_a_warned_job_saves_is_queued_again_and_goes_on(tmp_path, signals):
     # It saved when it was asked to, not only every five episodes.
     assert (run.folder / "checkpoints" / f"frame_{done * FRAMES:012d}").exists()
     assert job in slurm.queued_jobs([run])
-    _hurry(job)
-    _wait_for(lambda: state.is_finished(run))
+    _wait_for_requeued(job, lambda: state.is_finished(run))
     assert f"from episode {done}\n" in (run.folder / "log.txt").read_text()
     _check_rows(run, processes=2)
 
@@ -143,9 +142,8 @@ def test_a_job_that_was_killed_goes_on_from_its_last_checkpoint(tmp_path):
         os.kill(process, signal.SIGKILL)
     _wait_for(lambda: job not in slurm.queued_jobs([killed]))
     _output("scontrol", "requeue", job)
-    _hurry(job)
     for run in (killed, other):
-        _wait_for(lambda run=run: state.is_finished(run))
+        _wait_for_requeued(job, lambda run=run: state.is_finished(run))
     assert "from episode 5\n" in (killed.folder / "log.txt").read_text()
     _check_rows(killed, processes=2)
     _check_rows(other, processes=1)
@@ -181,8 +179,8 @@ def test_a_sweep_of_real_runs_survives_a_requeue(tmp_path):
     _wait_for(lambda: list(home.glob("checkpoints/frame_*")), seconds=400)
     job = (home / "slurm_job").read_text()
     _output("scontrol", "requeue", job)
-    _hurry(job)
-    _wait_for(lambda: "1 finished" in _run([*arguments, "--watch"]), seconds=400)
+    watch = [*arguments, "--watch"]
+    _wait_for_requeued(job, lambda: "1 finished" in _run(watch), seconds=400)
     assert "going on from the checkpoint" in (home / "log.txt").read_text()
     # The episode that was cut off is dropped, so frames are no round numbers.
     table = read_csv(home / "train.csv")
@@ -200,12 +198,15 @@ def _run(arguments) -> str:
     return done.stdout
 
 
-def _hurry(job: str) -> None:
-    """Spares a requeued job the two minutes that Slurm lets it wait."""
-    _wait_for(
-        lambda: "PENDING" in _output("squeue", "--noheader", "--format=%T", f"-j{job}")
-    )
-    _output("scontrol", "update", f"JobId={job}", "StartTime=now")
+def _wait_for_requeued(job: str, condition, seconds: float = _SECONDS) -> None:
+    """Waits without the two minutes for which Slurm holds a requeued job back."""
+
+    def holds() -> bool:
+        # Said again and again: while a job is still being requeued, it is not heard.
+        _output("scontrol", "update", f"JobId={job}", "StartTime=now")
+        return condition()
+
+    _wait_for(holds, seconds)
 
 
 def _ports() -> dict[str, int]:

@@ -129,17 +129,15 @@ def test_a_failed_replacement_leaves_the_old_file(tmp_path, monkeypatch):
 
 
 def test_metrics_write_tables_and_events(tmp_path):
-    metrics = Metrics(tmp_path, extra_eval_columns=["wasserstein_to_expert"])
+    metrics = Metrics(tmp_path, extra_eval_columns=["actor_pre_tanh"])
     metrics.train({"frame": 1000, "episode": 1, "task_return": 12.5, "length": 500})
-    metrics.evaluation(
-        {"frame": 1000, "task_return_mean": 20, "wasserstein_to_expert": 1}
-    )
+    metrics.evaluation({"frame": 1000, "task_return_mean": 20, "actor_pre_tanh": 1})
     metrics.scalars(1000, {"losses/critic": np.float32(0.25)})
     metrics.close()
 
     assert read_csv(tmp_path / "train.csv")["task_return"] == [12.5]
     evaluations = read_csv(tmp_path / "eval.csv")
-    assert list(evaluations) == [*EVAL_COLUMNS, "wasserstein_to_expert"]
+    assert list(evaluations) == [*EVAL_COLUMNS, "actor_pre_tanh"]
     (events,) = (tmp_path / "tensorboard").iterdir()
     content = events.read_bytes()
     for tag in (b"train/task_return", b"eval/task_return_mean", b"losses/critic"):
