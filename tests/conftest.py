@@ -1,12 +1,18 @@
 """Strictness for all tests: no silent broadcasting, and one way of drawing."""
 
 import os
+import signal
 
 # Before jax and MuJoCo are imported anywhere: flags and GL are read only once.
 from jaxil import platform
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 platform.prepare()
+
+# A shell that starts the tests in the background has them ignore Ctrl-C, and with them
+# all programs whose Ctrl-C is tested.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import jax  # noqa: E402
 
