@@ -9,10 +9,12 @@ from jaxil import platform
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 platform.prepare()
 
-# A shell that starts the tests in the background has them ignore Ctrl-C, and with them
-# all programs whose Ctrl-C is tested.
+# A shell that starts the tests in the background has them ignore Ctrl-C, nohup has them
+# ignore hang-ups, and so would all programs whose signals are tested.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 import jax  # noqa: E402
 
