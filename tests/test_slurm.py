@@ -22,6 +22,7 @@ from tests.trainer import FRAMES, stand_in
 _DAEMONS = ("slurmctld", "slurmd")
 # For what takes ten on an idle machine; Slurm may hold a requeued job for two minutes.
 _SECONDS = 300.0
+_CREDENTIAL_SECONDS = 2.0
 
 _missing = [daemon for daemon in _DAEMONS if not shutil.which(daemon)]
 if os.geteuid() != 0:
@@ -143,8 +144,8 @@ def test_a_job_that_was_killed_goes_on_from_its_last_checkpoint(tmp_path):
         os.kill(process, signal.SIGKILL)
     _wait_for(lambda: job not in slurm.queued_jobs([killed]))
     _output("scontrol", "requeue", job)
-    for run in (killed, other):
-        _wait_for_requeued(job, lambda run=run: state.is_finished(run))
+    _wait_for_requeued(job, lambda: state.is_finished(killed))
+    _wait_for(lambda: state.is_finished(other))
     assert "from episode 5\n" in (killed.folder / "log.txt").read_text()
     _check_rows(killed, processes=2)
     _check_rows(other, processes=1)
@@ -201,13 +202,21 @@ def _run(arguments) -> str:
 
 def _wait_for_requeued(job: str, condition, seconds: float = _SECONDS) -> None:
     """Waits without the two minutes for which Slurm holds a requeued job back."""
+    _wait_for(lambda: _state_of(job) == "PENDING")
+    # Slurm holds it back because a node refuses a job that starts again within the
+    # second in which it was ended ("Job credential revoked"), and then it has failed.
+    time.sleep(_CREDENTIAL_SECONDS)
 
     def holds() -> bool:
-        # Said again and again: while a job is still being requeued, it is not heard.
-        _output("scontrol", "update", f"JobId={job}", "StartTime=now")
+        if _state_of(job) == "PENDING":
+            _output("scontrol", "update", f"JobId={job}", "StartTime=now")
         return condition()
 
     _wait_for(holds, seconds)
+
+
+def _state_of(job: str) -> str:
+    return _output("squeue", "--noheader", f"--jobs={job}", "--format=%T").strip()
 
 
 def _ports() -> dict[str, int]:
@@ -236,5 +245,12 @@ def _output(*arguments: str) -> str:
 def _wait_for(condition, seconds: float = _SECONDS) -> None:
     end = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < end, "too slow"
+        assert time.monotonic() < end, f"too slow\n{_what_slurm_says()}"
         time.sleep(0.2)
+
+
+def _what_slurm_says() -> str:
+    home = pathlib.Path(os.environ["SLURM_CONF"]).parent
+    logs = [home / f"{name}.log" for name in _DAEMONS]
+    tails = (path.read_text()[-3000:] for path in logs if path.exists())
+    return "\n".join([_output("scontrol", "show", "jobs"), *tails])
