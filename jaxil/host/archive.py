@@ -21,8 +21,7 @@ _DAMAGES = (
     zlib.error,
     struct.error,
     EOFError,
-    NotImplementedError,  # an unknown compression
-    RuntimeError,  # encrypted
+    RuntimeError,  # encrypted; and NotImplementedError, such as a later version
 )
 
 # How many bytes one compressed byte can stand for, at most.
