@@ -1,9 +1,12 @@
 """A report is replaced as a whole, and nothing else ever is."""
 
 import os
+import pathlib
 import signal
 import subprocess
 import sys
+import types
+import unittest.mock
 
 import pytest
 
@@ -31,12 +34,50 @@ def test_a_report_replaces_a_report(tmp_path):
         assert names(tmp_path / "deep") == ["report"]
 
 
-def test_without_an_atomic_exchange_it_works_too(tmp_path, monkeypatch):
-    def none(*_, **__):
-        raise OSError("no such function")
+def no_library(*_, **__):
+    raise OSError("no such library")
 
-    monkeypatch.setattr(folder.ctypes, "CDLL", none)
+
+def no_function(*_, **__):
+    return types.SimpleNamespace()
+
+
+def no_support(*_, **__):
+    return types.SimpleNamespace(renameat2=lambda *_: -1)
+
+
+@pytest.fixture(params=[no_library, no_function, no_support])
+def lacking_exchange(request, monkeypatch):
+    """A system that can't swap two folders; counts how often it was asked to."""
+    load = unittest.mock.Mock(side_effect=request.param)
+    monkeypatch.setattr(folder.ctypes, "CDLL", load)
+    return load
+
+
+def test_without_an_atomic_exchange_it_works_too(tmp_path, lacking_exchange):
     test_a_report_replaces_a_report(tmp_path)
+    assert lacking_exchange.call_count == 1  # the first report replaces nothing
+
+
+def test_without_an_atomic_exchange_a_failure_leaves_the_old_one(
+    tmp_path, monkeypatch, lacking_exchange
+):
+    output = tmp_path / "report"
+    write(output, "old")
+    rename = pathlib.Path.rename
+
+    def fail_for_the_new_one(self, target):
+        if self.suffix == ".tmp":
+            assert not output.exists(), "the old one is out of the way"
+            raise OSError("disk full")
+        return rename(self, target)
+
+    monkeypatch.setattr(pathlib.Path, "rename", fail_for_the_new_one)
+    with pytest.raises(OSError, match="disk full"):
+        write(output, "new")
+    assert lacking_exchange.called
+    assert (output / "tables" / "runs.csv").read_text() == "old"
+    assert names(tmp_path) == ["report"]
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
