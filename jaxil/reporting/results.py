@@ -13,7 +13,7 @@ from jaxil.reporting.groups import Group, changes, expert_returns, tasks_of
 from jaxil.reporting.measures import LEVELS, Curve, Final
 from jaxil.reporting.runs import Run
 from jaxil.reporting.sheets import Panel, Sheet
-from jaxil.reporting.tables import Column, Table
+from jaxil.reporting.tables import Column, Kind, Table
 
 _NAN = float("nan")
 _LOGITS = ("discriminator/expert_logit", "discriminator/agent_logit")
@@ -173,12 +173,8 @@ def final_table(finals: Sequence[Final]) -> Table:
         Column("variant", "variant"),
         Column("runs", "runs", "count"),
         Column("finished", "finished", "count"),
-        Column("mean", "mean", "return"),
-        Column("mean_low", f"{_PERCENT} from", "return"),
-        Column("mean_high", "to", "return"),
-        Column("iqm", "IQM", "return"),
-        Column("iqm_low", f"{_PERCENT} from", "return"),
-        Column("iqm_high", "to", "return"),
+        *_interval_columns("mean", "mean", "return"),
+        *_interval_columns("iqm", "IQM", "return"),
         Column("median", "median", "return"),
         Column("expert", "expert", "return"),
         Column("share_of_expert", "of the expert", "share"),
@@ -209,9 +205,7 @@ def aggregate_table(finals: Sequence[Final]) -> Table | None:
         Column("variant", "variant"),
         Column("tasks", "tasks", "count"),
         Column("runs", "runs", "count"),
-        Column("iqm", "IQM", "share"),
-        Column("iqm_low", f"{_PERCENT} from", "share"),
-        Column("iqm_high", "to", "share"),
+        *_interval_columns("iqm", "IQM", "share"),
         Column("median", "median", "share"),
         Column("mean", "mean", "share"),
     )
@@ -327,6 +321,15 @@ def shared_changes(study: Study) -> dict[str, Any]:
         for field, value in first.items()
         if all(field in other and other[field] == value for other in others)
     }
+
+
+def _interval_columns(key: str, title: str, kind: Kind) -> tuple[Column, ...]:
+    """Returns the columns of a `statistics.Estimate`: a value and its bounds."""
+    return (
+        Column(key, title, kind),
+        Column(f"{key}_low", f"{_PERCENT} from", kind),
+        Column(f"{key}_high", "to", kind),
+    )
 
 
 def _sheet(
