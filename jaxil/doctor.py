@@ -106,8 +106,8 @@ def gl_libraries() -> Iterator[Finding]:
 
 
 def rendering(config: Any) -> Iterator[Finding]:
-    """Draws with the backend in force, at both qualities, and times it."""
-    from jaxil.host import environment as environments
+    """Draws with the backend in force, at each quality, and times it."""
+    from jaxil.host.camera import RENDER_QUALITIES
 
     backend = os.environ.get("MUJOCO_GL", "")
     if backend in ("disable", "disabled", "off", "false", "0"):
@@ -119,7 +119,7 @@ def rendering(config: Any) -> Iterator[Finding]:
         task, image_size = config.task, config.image_size
     milliseconds = {}
     name = ""
-    for quality in environments.RENDER_QUALITIES:
+    for quality in RENDER_QUALITIES:
         try:
             name, milliseconds[quality] = _frame_milliseconds(task, image_size, quality)
         except (ImportError, RuntimeError) as error:
