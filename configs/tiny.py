@@ -18,6 +18,9 @@ apart, so at 2 repeats nothing shows its speed, and agents learn to spin it and 
 from jaxil import config as jaxil_config
 
 _ACTION_REPEATS = {"cartpole_swingup": 8}
+# Each sample costs these two a pass through convolutions of the discriminator's own,
+# DAC a second derivative of it as well: at 64, an update takes five times as long.
+_DISCRIMINATOR_BATCHES = {"dac": 16, "sil": 16}
 
 
 def get_config(argument: str = "pdac,cartpole_swingup"):
@@ -47,8 +50,9 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     config.replay_size_steps = 50_000
     config.exploration_std_steps = 50_000
     config.discriminator.hidden_dim = 256
-    config.discriminator.batch_size = 64
+    config.discriminator.batch_size = _DISCRIMINATOR_BATCHES.get(method, 64)
     config.discriminator.learning_rate = 3e-4
+    config.cloning.batch_size = 64
     config.sinkhorn.target_update_steps = 5_000
     config.sinkhorn.num_iterations = 50
     config.eval_every_frames = 10_000
