@@ -52,11 +52,12 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     config.discriminator.hidden_dim = 256
     config.discriminator.batch_size = _DISCRIMINATOR_BATCHES.get(method, 64)
     config.discriminator.learning_rate = 3e-4
-    config.cloning.batch_size = 64
     config.sinkhorn.target_update_steps = 5_000
     config.sinkhorn.num_iterations = 50
     config.eval_every_frames = 10_000
     config.checkpoint_every_frames = 10_000
+    if method == "bc":
+        config.cloning.batch_size = 64
     if config.action_repeat > 2:  # fewer decisions in as many frames
         config.exploration_steps = 500
         config.exploration_std_steps = 20_000
