@@ -24,7 +24,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxil.host.replay import Episode, Replay
+from jaxil.host.episode import Episode
+from jaxil.host.replay import Replay
 
 _NUM_KEPT = 2  # the newest, and the one to fall back to
 _FORMAT = 1

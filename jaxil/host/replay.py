@@ -7,12 +7,13 @@ episodes enter, and the oldest whole episodes leave.
 Axes: B batch, T steps of an episode, n the length of a window, H W C pixels.
 """
 
-import collections
 import math
 from typing import NamedTuple
 
 import numpy as np
 
+from jaxil.host.episode import require
+from jaxil.host.ring import EpisodeRing, ring_slots
 from jaxil.host.stacking import gather_stacks
 
 
@@ -38,20 +39,6 @@ class Batch(NamedTuple):
     window: Window | None  # None unless asked for
 
 
-class Episode(NamedTuple):
-    """One episode as it is stored."""
-
-    frames: np.ndarray  # [T + 1, H, W, C] uint8 or [T + 1, S] float32
-    actions: np.ndarray  # [T, A] float32
-    rewards: np.ndarray  # [T] float32: rewards[t] belongs to (o_t, a_t, o_{t+1})
-    discounts: np.ndarray  # [T] float32: the environment's own, 0 after a true end
-
-
-class _Stored(NamedTuple):
-    start: int  # slot of the episode's first frame
-    num_steps: int
-
-
 def memory_bytes(
     *,
     capacity_steps: int,
@@ -75,7 +62,7 @@ def memory_bytes(
         observation_shape=observation_shape,
         observation_dtype=observation_dtype,
     )
-    return frames + _num_slots(capacity_steps, episode_steps) * 4 * (action_dim + 2)
+    return frames + ring_slots(capacity_steps, episode_steps) * 4 * (action_dim + 2)
 
 
 def frames_bytes(
@@ -87,19 +74,11 @@ def frames_bytes(
 ) -> int:
     """Says how much of `memory_bytes` is frames, of which a device may hold a copy."""
     frame_bytes = math.prod(observation_shape) * np.dtype(observation_dtype).itemsize
-    return _num_slots(capacity_steps, episode_steps) * frame_bytes
+    return ring_slots(capacity_steps, episode_steps) * frame_bytes
 
 
-def _num_slots(capacity_steps: int, episode_steps: int) -> int:
-    return capacity_steps + math.ceil(capacity_steps / episode_steps)
-
-
-class Replay:
-    """Stores the newest episodes and samples n-step transitions from them, uniformly.
-
-    The next free slot follows the newest frame, modulo the ring's length; an episode
-    may run over the ring's end. A slot holds o_t with the a_t, r_t and d_t that follow.
-    """
+class Replay(EpisodeRing):
+    """Stores the newest episodes and draws n-step transitions from them, uniformly."""
 
     def __init__(
         self,
@@ -128,160 +107,26 @@ class Replay:
         Raises:
           ValueError: if a number breaks its rule.
         """
-        shape = tuple(observation_shape)
-        for name, value, rule, holds in (
-            ("episode_steps", episode_steps, ">= 1", episode_steps >= 1),
-            ("observation_shape", shape, "(H, W, C) or (S,)", len(shape) in (1, 3)),
-            ("action_dim", action_dim, ">= 1", action_dim >= 1),
-            ("frame_stack", frame_stack, ">= 1", frame_stack >= 1),
-            ("num_steps", num_steps, ">= 1", num_steps >= 1),
-            (
-                "discount_factor",
-                discount_factor,
-                "in [0, 1]",
-                0 <= discount_factor <= 1,
-            ),
-        ):
-            _require(holds, name, value, rule)
-        enough = f"room for an episode, {episode_steps} steps"
-        _require(
-            capacity_steps >= episode_steps, "capacity_steps", capacity_steps, enough
+        require(frame_stack >= 1, "frame_stack", frame_stack, ">= 1")
+        require(num_steps >= 1, "num_steps", num_steps, ">= 1")
+        in_range = 0 <= discount_factor <= 1
+        require(in_range, "discount_factor", discount_factor, "in [0, 1]")
+        stackable = len(observation_shape) != 1 or frame_stack == 1
+        require(stackable, "frame_stack", frame_stack, "1 for states")
+        super().__init__(
+            capacity_steps=capacity_steps,
+            episode_steps=episode_steps,
+            observation_shape=observation_shape,
+            observation_dtype=observation_dtype,
+            action_dim=action_dim,
         )
-        states = len(shape) == 1
-        _require(
-            not states or frame_stack == 1, "frame_stack", frame_stack, "1 for states"
-        )
-        self._capacity_steps = capacity_steps
         self._frame_stack = frame_stack
         self._window = num_steps
         self._discount_factor = discount_factor
-        num_slots = _num_slots(capacity_steps, episode_steps)
-        # np.empty and np.zeros touch no page yet: memory use grows with the run.
-        self._frames = np.empty((num_slots, *shape), observation_dtype)
-        self._actions = np.zeros((num_slots, action_dim), np.float32)
-        self._rewards = np.zeros(num_slots, np.float32)
-        self._discounts = np.zeros(num_slots, np.float32)
-        self.clear()
-
-    def clear(self, first_episode: int = 0) -> None:
-        """Forgets all episodes; the next one added gets the number `first_episode`."""
-        self._stored: collections.deque[_Stored] = collections.deque()
-        self._num_episodes_added = first_episode
-        self._num_steps_stored = 0
-        self._num_frames_stored = 0
-        self._next_slot = 0
-        self._index_starts()
-
-    @property
-    def frames(self) -> np.ndarray:
-        """The ring of frames itself, read-only: [num_slots, H, W, C] or [.., S]."""
-        ring = self._frames.view()
-        ring.flags.writeable = False
-        return ring
-
-    @property
-    def num_steps_stored(self) -> int:
-        """Transitions in the replay now."""
-        return self._num_steps_stored
-
-    @property
-    def num_episodes_stored(self) -> int:
-        """Episodes in the replay now."""
-        return len(self._stored)
-
-    @property
-    def num_episodes_added(self) -> int:
-        """Episodes ever added; the newest one has the number below this."""
-        return self._num_episodes_added
-
-    @property
-    def oldest_episode(self) -> int:
-        """Number of the oldest episode that is still stored."""
-        return self._num_episodes_added - len(self._stored)
-
-    def add_episode(self, *, frames, actions, rewards, discounts) -> None:
-        """Copies one whole episode in; the oldest ones make room for it.
-
-        Args:
-          frames: [T + 1, H, W, C] uint8, or [T + 1, S] float32: o_0 ... o_T, unstacked.
-          actions: [T, A] float, finite: actions[t] was taken on seeing o_t.
-          rewards: [T] float, finite: rewards[t] came with o_{t+1}.
-          discounts: [T] float in [0, 1]: 0 after a true end, 1 at a time limit.
-
-        Raises:
-          ValueError: for a wrong shape or dtype, a number that is not finite, or an
-            episode that is longer than the replay; nothing is changed then.
-        """
-        frames, actions, rewards, discounts = self._checked(
-            frames, actions, rewards, discounts
-        )
-        num_steps = len(rewards)
-        num_slots = len(self._frames)
-        fits = num_steps <= self._capacity_steps and num_steps < num_slots
-        _require(
-            fits, "episode length", num_steps, f"at most {self._capacity_steps} steps"
-        )
-
-        while (
-            self._num_steps_stored + num_steps > self._capacity_steps
-            or self._num_frames_stored + num_steps + 1 > num_slots
-        ):
-            evicted = self._stored.popleft()
-            self._num_steps_stored -= evicted.num_steps
-            self._num_frames_stored -= evicted.num_steps + 1
-        start = self._next_slot
-        # In two pieces where the ring ends: slices copy faster than index lists.
-        head = min(num_steps + 1, num_slots - start)
-        self._frames[start : start + head] = frames[:head]
-        self._frames[: num_steps + 1 - head] = frames[head:]
-        slots = (start + np.arange(num_steps)) % num_slots
-        self._actions[slots] = actions
-        self._rewards[slots] = rewards
-        self._discounts[slots] = discounts
-        self._stored.append(_Stored(start, num_steps))
-        self._next_slot = (start + num_steps + 1) % num_slots
-        self._num_steps_stored += num_steps
-        self._num_frames_stored += num_steps + 1
-        self._num_episodes_added += 1
-        self._index_starts()
-
-    def episode(self, index: int) -> Episode:
-        """Copies one stored episode out.
-
-        Args:
-          index: its number, `oldest_episode` <= index < `num_episodes_added`.
-
-        Raises:
-          IndexError: if it is not stored.
-        """
-        slots = self.slots(index)
-        return Episode(
-            frames=self._frames[slots],
-            actions=self._actions[slots[:-1]],
-            rewards=self._rewards[slots[:-1]],
-            discounts=self._discounts[slots[:-1]],
-        )
-
-    def slots(self, index: int) -> np.ndarray:
-        """Returns where the frames of a stored episode lie in `frames`, [T + 1].
-
-        Args:
-          index: see `episode`.
-
-        Raises:
-          IndexError: if it is not stored.
-        """
-        if not self.oldest_episode <= index < self._num_episodes_added:
-            raise IndexError(
-                f"episode {index} is not stored: the replay holds"
-                f" {self.oldest_episode} to {self._num_episodes_added - 1}"
-            )
-        start, num_steps = self._stored[index - self.oldest_episode]
-        return (start + np.arange(num_steps + 1)) % len(self._frames)
 
     def can_sample(self) -> bool:
         """Says whether any stored episode is long enough for a window of n steps."""
-        return self._num_starts > 0
+        return bool(self._num_windows().any())
 
     def sample(
         self, rng: np.random.Generator, batch_size: int, *, windows: bool = False
@@ -336,15 +181,18 @@ class Replay:
         Raises:
           ValueError: if no stored episode is as long as a window.
         """
-        if not self.can_sample():
+        num_windows = self._num_windows()
+        if not num_windows.any():
             raise ValueError(
                 f"num_steps_stored = {self._num_steps_stored}: expected an episode of"
                 f" at least {self._window} steps; add one before sampling"
             )
-        flat = rng.integers(self._num_starts, size=batch_size)
-        which = np.searchsorted(self._last_starts, flat, side="right")
-        steps = flat - self._first_starts[which]  # t of each window in its episode
-        starts = self._episode_slots[which]
+        # Laid end to end, so that one draw picks an episode and a time t in it.
+        ends = np.cumsum(num_windows)
+        flat = rng.integers(int(ends[-1]), size=batch_size)
+        which = np.searchsorted(ends, flat, side="right")
+        steps = flat - (ends - num_windows)[which]
+        starts = self._starts[which]
 
         slots = (starts + steps)[:, None] + np.arange(self._window)
         slots %= len(self._frames)
@@ -371,81 +219,9 @@ class Replay:
             window=window,
         )
 
-    def check_valid(self) -> tuple[bool, str]:
-        """Checks that the books agree with one another.
-
-        Returns:
-          (True, "") or (False, what is wrong).
-        """
-        num_slots = len(self._frames)
-        steps = sum(stored.num_steps for stored in self._stored)
-        frames = steps + len(self._stored)
-        if steps != self._num_steps_stored or steps > self._capacity_steps:
-            return False, (
-                f"{steps} steps stored, counted {self._num_steps_stored},"
-                f" capacity {self._capacity_steps}"
-            )
-        if frames != self._num_frames_stored or frames > num_slots:
-            return False, (
-                f"{frames} frames stored, counted {self._num_frames_stored},"
-                f" {num_slots} slots"
-            )
-        if self.oldest_episode < 0:
-            return False, f"oldest episode is number {self.oldest_episode}"
-        expected = (self._next_slot - frames) % num_slots
-        for number, stored in enumerate(self._stored, start=self.oldest_episode):
-            if stored.num_steps < 1:
-                return False, f"episode {number} has {stored.num_steps} steps"
-            if stored.start != expected:
-                return False, (
-                    f"episode {number} starts in slot {stored.start}:"
-                    f" expected {expected}"
-                )
-            expected = (expected + stored.num_steps + 1) % num_slots
-        windows = sum(max(s.num_steps - self._window + 1, 0) for s in self._stored)
-        if windows != self._num_starts:
-            return False, f"{windows} windows stored, {self._num_starts} indexed"
-        return True, ""
-
-    def _checked(self, frames, actions, rewards, discounts) -> Episode:
-        """Returns the arrays in the types that are stored, or raises ValueError."""
-        frames = np.asarray(frames)
-        _require(frames.ndim > 0, "frames.shape", frames.shape, "[T + 1, ...]")
-        _require(len(frames) > 1, "frames.shape", frames.shape, "at least two frames")
-        arrays = []
-        for name, array, ring in (
-            ("frames", frames, self._frames),
-            ("actions", np.asarray(actions), self._actions),
-            ("rewards", np.asarray(rewards), self._rewards),
-            ("discounts", np.asarray(discounts), self._discounts),
-        ):
-            expected = (len(frames) - (name != "frames"), *ring.shape[1:])
-            _require(array.shape == expected, f"{name}.shape", array.shape, expected)
-            if name == "frames":
-                same = array.dtype == ring.dtype
-                _require(same, "frames.dtype", array.dtype, ring.dtype)
-            else:
-                real = array.dtype.kind in "fiu"
-                _require(real, f"{name}.dtype", array.dtype, "real numbers")
-                with np.errstate(over="ignore"):  # becomes inf, which is refused below
-                    array = array.astype(ring.dtype)
-            good, rule = np.isfinite(array), "finite"
-            if name == "discounts":
-                good, rule = (array >= 0) & (array <= 1), "in [0, 1]"
-            if not good.all():
-                first = tuple(np.argwhere(~good)[0].tolist())
-                _require(False, f"{name}{list(first)}", array[first], rule)
-            arrays.append(array)
-        return Episode(*arrays)
-
-    def _index_starts(self) -> None:
-        """Lays the starts of all windows end to end, so that one draw picks one."""
-        lengths = np.array([stored.num_steps for stored in self._stored], np.int64)
-        counts = np.maximum(lengths - self._window + 1, 0)
-        self._last_starts = np.cumsum(counts)  # exclusive end of each episode's starts
-        self._first_starts = self._last_starts - counts
-        self._episode_slots = np.array([stored.start for stored in self._stored], int)
-        self._num_starts = int(counts.sum())
+    def _num_windows(self) -> np.ndarray:
+        """Returns how many windows each stored episode has, [episodes]."""
+        return np.maximum(self._lengths - self._window + 1, 0)
 
     def _stack_slots(self, starts: np.ndarray, steps: np.ndarray) -> np.ndarray:
         """Says where the frames of o_t lie, of episodes that begin in slots `starts`.
@@ -456,8 +232,3 @@ class Replay:
         ages = np.arange(self._frame_stack)[::-1]
         slots = starts[..., None] + np.maximum(steps[..., None] - ages, 0)
         return (slots % len(self._frames)).astype(np.int32)
-
-
-def _require(condition: bool, name: str, value: object, rule: object) -> None:
-    if not condition:
-        raise ValueError(f"{name} = {value}: expected {rule}")

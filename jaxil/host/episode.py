@@ -1,0 +1,66 @@
+"""An episode as the replay stores it, and what may be stored.
+
+Axes: T steps of an episode, H W C pixels, S numbers of a state.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Episode(NamedTuple):
+    """One episode as it is stored."""
+
+    frames: np.ndarray  # [T + 1, H, W, C] uint8 or [T + 1, S] float32
+    actions: np.ndarray  # [T, A] float32
+    rewards: np.ndarray  # [T] float32: rewards[t] belongs to (o_t, a_t, o_{t+1})
+    discounts: np.ndarray  # [T] float32: the environment's own, 0 after a true end
+
+
+def checked_episode(frames, actions, rewards, discounts, *, like: Episode) -> Episode:
+    """Returns arrays of one episode in the types that are stored.
+
+    Args:
+      frames: see `Episode`; its dtype is not changed.
+      actions: real numbers, finite, as are the next two.
+      rewards: see `Episode`.
+      discounts: in [0, 1].
+      like: arrays of the right dtypes and of the right shapes behind the first axis.
+
+    Raises:
+      ValueError: for a wrong shape or dtype, or a number that is out of range.
+    """
+    frames = np.asarray(frames)
+    require(frames.ndim > 0, "frames.shape", frames.shape, "[T + 1, ...]")
+    require(len(frames) > 1, "frames.shape", frames.shape, "at least two frames")
+    arrays = []
+    for name, array, ring in (
+        ("frames", frames, like.frames),
+        ("actions", np.asarray(actions), like.actions),
+        ("rewards", np.asarray(rewards), like.rewards),
+        ("discounts", np.asarray(discounts), like.discounts),
+    ):
+        expected = (len(frames) - (name != "frames"), *ring.shape[1:])
+        require(array.shape == expected, f"{name}.shape", array.shape, expected)
+        if name == "frames":
+            same = array.dtype == ring.dtype
+            require(same, "frames.dtype", array.dtype, ring.dtype)
+        else:
+            real = array.dtype.kind in "fiu"
+            require(real, f"{name}.dtype", array.dtype, "real numbers")
+            with np.errstate(over="ignore"):  # becomes inf, which is refused below
+                array = array.astype(ring.dtype)
+        good, rule = np.isfinite(array), "finite"
+        if name == "discounts":
+            good, rule = (array >= 0) & (array <= 1), "in [0, 1]"
+        if not good.all():
+            first = tuple(np.argwhere(~good)[0].tolist())
+            require(False, f"{name}{list(first)}", array[first], rule)
+        arrays.append(array)
+    return Episode(*arrays)
+
+
+def require(condition: bool, name: str, value: object, rule: object) -> None:
+    """Raises a ValueError that says which rule a value breaks, unless it holds."""
+    if not condition:
+        raise ValueError(f"{name} = {value}: expected {rule}")
