@@ -119,6 +119,10 @@ def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Conf
     # So many updates are sent to the device at once: less waiting, but the policy that
     # acts lags by that less one. Episode ends, evaluations and checkpoints see all.
     config.updates_per_dispatch = 1
+    # So many environments play side by side, each in a process of its own. All of them
+    # take one decision by the same policy, which so lags by that less one; frames in
+    # all, and frames for each update, stay the same.
+    config.num_environments = 1
     # Of convolutions and the product that follows them; all that is kept is float32.
     config.compute_dtype = "float32"  # or "bfloat16"
 
@@ -209,6 +213,7 @@ _RANGES: dict[str, tuple[float, float, str]] = {
     "exploration_steps": (0, 10**9, "agent steps of uniform actions; 2000 in DrQ-v2"),
     "update_every_steps": (1, 10**6, "2 in the paper"),
     "updates_per_dispatch": (1, 1_000, "1 lets the policy follow each update"),
+    "num_environments": (1, 64, "each is a process; 1 plays in this one"),
     "feature_dim": (1, 10**5, "50 in the paper"),
     "hidden_dim": (1, 10**5, "1024 in the paper"),
     "noise_clip": (0.0, 2.0, "0.3 in DrQ-v2"),

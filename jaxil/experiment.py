@@ -1,5 +1,7 @@
 """From a checked config to the parts of a run: environments, learner, rewarder."""
 
+import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -15,12 +17,20 @@ from jaxil.host.environment import (
     known_tasks,
     make_environment,
 )
+from jaxil.host.pool import Pool
 from jaxil.host.progress import ProgressLine
 from jaxil.host.replay import Replay
 from jaxil.host.states import DemonstrationError
 from jaxil.learner.cloning import make_cloning_step
 from jaxil.learner.gathering import Step, make_gathering_step, make_repeated_step
-from jaxil.learner.policy import Exploit, Explore, make_exploit, make_explore
+from jaxil.learner.policy import (
+    Exploit,
+    Explore,
+    ExploreTogether,
+    make_exploit,
+    make_explore,
+    make_explore_together,
+)
 from jaxil.learner.state import TrainState
 from jaxil.learner.update import (
     Learner,
@@ -52,6 +62,7 @@ class Agent(NamedTuple):
         donates state; see `gathering.make_gathering_step`.
       repeated_step: the same for several batches, see `gathering.make_repeated_step`.
       explore: see `policy.make_explore`.
+      explore_together: see `policy.make_explore_together`.
       exploit: see `policy.make_exploit`.
       rewards: the rewarder's, at episode end.
       plan: the rewarder's, for people; None where it has none.
@@ -62,6 +73,7 @@ class Agent(NamedTuple):
     update_step: Step
     repeated_step: Step
     explore: Explore
+    explore_together: ExploreTogether
     exploit: Exploit
     rewards: Any
     plan: Any
@@ -124,15 +136,45 @@ def evaluation_environment(config: Config) -> PixelEnvironment:
 
 def environment_with_seed(config: Config, seed: int) -> PixelEnvironment:
     """Returns the run's environment with another seed for its resets."""
-    return make_environment(
-        config.task,
-        seed=seed,
-        action_repeat=config.action_repeat,
-        image_size=config.image_size,
-        frame_stack=config.frame_stack,
-        render_quality=config.render_quality,
-        observation=config.observation,
+    return make_environment(config.task, seed=seed, **_environment_settings(config))
+
+
+def training_pool(
+    config: Config, environment: PixelEnvironment, say: Callable[[str], None]
+) -> Pool | None:
+    """Returns processes that gather experience side by side; None for a single one.
+
+    Their environments have one seed: an episode's number alone fixes its start,
+    whichever of them plays it.
+
+    Args:
+      config: checked.
+      environment: such as the processes make; what it shows is not kept.
+      say: takes a line for people.
+    """
+    if config.num_environments == 1 or config.method == "bc":  # which plays nothing
+        return None
+    # The child finds what this names without jax, which would take memory and seconds.
+    make = functools.partial(
+        make_environment, config.task, seed=config.seed, **_environment_settings(config)
     )
+    return Pool(
+        make,
+        config.num_environments,
+        observation=environment.reset(episode=0).observation,
+        frame=environment.single_observation(),
+        say=say,
+    )
+
+
+def _environment_settings(config: Config) -> dict[str, Any]:
+    return {
+        "action_repeat": config.action_repeat,
+        "image_size": config.image_size,
+        "frame_stack": config.frame_stack,
+        "render_quality": config.render_quality,
+        "observation": config.observation,
+    }
 
 
 def load_demonstrations(
@@ -359,6 +401,7 @@ def make_agent(
         update_step=jax.jit(step, donate_argnums=0),
         repeated_step=jax.jit(make_repeated_step(step), donate_argnums=0),
         explore=jax.jit(make_explore(networks, schedule)),
+        explore_together=jax.jit(make_explore_together(networks, schedule)),
         exploit=jax.jit(make_exploit(networks)),
         rewards=jax.jit(rewarder.rewards),
         plan=None if rewarder.plan is None else jax.jit(rewarder.plan),

@@ -28,6 +28,7 @@ def main(argv: list[str]) -> int:
     print(platform.prepare(), file=sys.stderr, flush=True)
 
     from jaxil import experiment, machine, train, workdir
+    from jaxil.host.pool import EnvironmentsFailed
 
     config = values.config
     folder = pathlib.Path(values.workdir)
@@ -40,7 +41,7 @@ def main(argv: list[str]) -> int:
             gl_name = experiment.renderer_name(config)
             workdir.write_config(folder, config, machine.describe(gl_name))
             finished = train.train(config, folder)
-        except train.TrainingDiverged as error:
+        except (train.TrainingDiverged, EnvironmentsFailed) as error:
             print(f"training stopped: {error}", file=sys.stderr)
             return 1
     return 0 if finished else 130

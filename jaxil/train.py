@@ -1,10 +1,12 @@
 """The loop: act, store, reward, learn, look. Read it from top to bottom."""
 
+import contextlib
 import dataclasses
+import functools
 import pathlib
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -16,10 +18,17 @@ from jaxil.config import METHODS, Config
 from jaxil.host import demonstrations as host_demonstrations
 from jaxil.host.checkpoint import Checkpoints
 from jaxil.host.evaluation import evaluate
-from jaxil.host.interaction import Decision, FinishedEpisode, interact, join
+from jaxil.host.interaction import (
+    Decision,
+    FinishedEpisode,
+    interact,
+    interact_together,
+    join,
+)
+from jaxil.host.pool import EnvironmentsFailed
 from jaxil.host.progress import ProgressLine
 from jaxil.host.signals import StopOnSignals
-from jaxil.host.stopwatch import Stopwatch, TimedEnvironment
+from jaxil.host.stopwatch import Stopwatch, TimedEnvironment, TimedPool
 from jaxil.learner.state import TrainState
 from jaxil.maths.types import Episode
 from jaxil.updates import Updates
@@ -40,7 +49,7 @@ class Counters:
 
     Attributes:
       num_steps: decisions of the agent so far.
-      num_episodes: whole episodes so far.
+      num_episodes: whole episodes so far; a resumed run begins with this number.
       num_evals: evaluations so far.
       last_eval_step: decision of the last evaluation.
       last_checkpoint_step: decision of the last checkpoint.
@@ -82,7 +91,7 @@ class Run:
         self.stopwatch = Stopwatch()
         self.metrics: dict[str, Any] = {}
         self.returns: dict[str, float] = {}  # of the last episode, for people
-        self.decisions: list[Decision] = []
+        self.decisions: dict[int, list[Decision]] = {}  # by episode under way
         self.stop_asked = False
         self.state: TrainState = self._restore_or_init()
         self.updates = Updates(
@@ -95,6 +104,9 @@ class Run:
         resumed = self.frame if self.counters.num_steps else None
         self.outputs = outputs.Outputs(workdir, config, demonstrations, resumed)
         self.progress = ProgressLine(config.total_frames, first_frame=self.frame)
+        self.pool = experiment.training_pool(
+            config, self.environment, lambda text: self.say(text)
+        )
 
     @property
     def frame(self) -> int:
@@ -107,29 +119,33 @@ class Run:
         `finish` has to follow.
 
         Args:
-          whole_episodes: whether an episode that is under way when the budget ends is
-            played to its end, so that it counts and the last evaluation takes place.
+          whole_episodes: whether episodes that are under way when the budget ends are
+            played to their end, so that they count and the last evaluation takes place.
+
+        Raises:
+          EnvironmentsFailed: there are several, and they can't go on.
+          TrainingDiverged: losses or rewards are not finite any more.
         """
         config, counters = self.config, self.counters
         if config.method == "bc":
             self.clone()
             return
-        decisions = interact(
-            TimedEnvironment(self.environment, self.stopwatch),
-            self.stopwatch.timed("update", self.act),
-            first_episode=counters.num_episodes,
-            meanwhile=self.learn,
-        )
+        self.decisions = {}
+        rounds = self.rounds()
         while not self.stop_asked and (
             self.frame < config.total_frames or (whole_episodes and self.decisions)
         ):
             # Act; learn; observe.
-            decision = next(decisions)
-            self.decisions.append(decision)
+            ended = []
+            for decision in next(rounds):
+                self.decisions.setdefault(decision.episode, []).append(decision)
+                if decision.is_last:
+                    ended.append(decision.episode)
 
             # Reward a finished episode, remember it, look at it.
-            if decision.is_last:
-                self.finish_episode()
+            for place, episode in enumerate(ended):
+                self.finish_episode(episode, later=ended[place + 1 :])
+            if ended:
                 if self.is_due(counters.last_eval_step, config.eval_every_frames):
                     self.evaluate()
                 if self.is_due(
@@ -139,12 +155,45 @@ class Run:
             self.progress.update(self.frame, self.stopwatch.seconds, self.returns)
         self.stopwatch.timed("update", self.flush)()
 
+    def rounds(self) -> Iterator[list[Decision]]:
+        """Returns the next decision of each environment, again and again."""
+        update = functools.partial(self.stopwatch.timed, "update")
+        if self.pool is not None:
+            return interact_together(
+                TimedPool(self.pool, self.stopwatch),
+                update(self.act_together),
+                first_episode=self.counters.num_episodes,
+                begin=self.begin_episode,
+                meanwhile=self.learn,
+            )
+        decisions = interact(
+            TimedEnvironment(self.environment, self.stopwatch),
+            update(self.act),
+            first_episode=self.counters.num_episodes,
+            meanwhile=self.learn,
+        )
+        return ([decision] for decision in decisions)
+
+    def begin_episode(self, episode: int) -> bool:
+        """Says whether one of several environments shall play an episode.
+
+        It shall if the budget has room for it beside those under way: so a run has as
+        many episodes as with one environment. One that was lost is played again.
+        """
+        length = self.environment.episode_steps or 0
+        left = sum(max(length - len(played), 0) for played in self.decisions.values())
+        planned = self.frame + left * self.config.action_repeat
+        if planned >= self.config.total_frames and episode not in self.decisions:
+            return False
+        self.decisions[episode] = []
+        return True
+
     def learn(self) -> None:
         """Counts a decision and starts the learner's step, where one is due.
 
         Between the action and its observation: jax only starts the update here, which
         then computes while the simulator does. The next action waits for it, so that
-        the policy never lags.
+        the policy of a single environment never lags.
         """
         self.counters.num_steps += 1
         if self.update_is_due():
@@ -187,8 +236,7 @@ class Run:
         """Returns an exploring action; uniform at first."""
         num_steps = self.counters.num_steps
         if num_steps < self.config.exploration_steps:
-            rng = self._rng(_UNIFORM_ACTIONS)
-            return rng.uniform(-1.0, 1.0, self.environment.action_spec().shape)
+            return self._uniform_action(num_steps)
         # The state is donated at each update: its parameters are read afresh.
         encoder, actor, _ = self.state.params
         return np.asarray(
@@ -201,6 +249,29 @@ class Run:
             )
         )
 
+    def act_together(self, observations: np.ndarray) -> np.ndarray:
+        """Returns exploring actions [E, A] of one policy, each with its own noise.
+
+        Args:
+          observations: one of each environment that plays, [E, ...].
+        """
+        count, size = len(observations), self.config.num_environments
+        steps = self.counters.num_steps + np.arange(size, dtype=np.uint32)
+        uniform = steps[:count] < self.config.exploration_steps
+        actions = np.empty((count, *self.environment.action_spec().shape), np.float32)
+        for place in np.flatnonzero(uniform):
+            actions[place] = self._uniform_action(int(steps[place]))
+        if not uniform.all():
+            # Of one size, though fewer may play at the end: it is compiled once.
+            padded = np.zeros((size, *observations.shape[1:]), observations.dtype)
+            padded[:count] = observations
+            encoder, actor, _ = self.state.params
+            explored = self.agent.explore_together(
+                encoder, actor, padded, self.exploration_key, steps
+            )
+            actions[~uniform] = np.asarray(explored)[:count][~uniform]
+        return actions
+
     def update_is_due(self) -> bool:
         """Says whether the learner steps after this decision."""
         return (
@@ -211,7 +282,8 @@ class Run:
 
     def update(self) -> None:
         """Draws a batch, and learns where enough of them are together."""
-        if self.updates.collect(self._rng(_SAMPLED_BATCHES)):
+        rng = self._rng(_SAMPLED_BATCHES, self.counters.num_steps)
+        if self.updates.collect(rng):
             self.flush()
 
     def flush(self) -> None:
@@ -220,10 +292,16 @@ class Run:
         if metrics is not None:
             self.metrics = metrics
 
-    def finish_episode(self) -> None:
-        """Rewards a finished episode once, and stores it for good."""
-        episode = join(self.decisions)
-        self.decisions = []
+    def finish_episode(self, number: int, *, later: Sequence[int] = ()) -> None:
+        """Rewards a finished episode once, and stores it for good.
+
+        Args:
+          number: of the episode.
+          later: those that ended in the same round and are finished after it. In the
+            table they stand as if played one after the other, in equal times.
+        """
+        episode = join(self.decisions.pop(number))
+        later_steps = sum(len(self.decisions[each]) for each in later)
         # Updates may not see an episode that entered after they were due, and rewards
         # are to come from all that was learned; their own clock starts after it.
         self.stopwatch.timed("update", self.flush)()
@@ -245,13 +323,14 @@ class Run:
             discounts=episode.discounts,
         )
         self.updates.episode_added()
-        self.counters.seconds = time.monotonic() - self.started
+        since_last_row = time.monotonic() - self.started - self.counters.seconds
+        self.counters.seconds += since_last_row / (1 + len(later))
         self.returns = {
             "task": float(np.sum(episode.task_rewards)),
             "imitation": float(np.sum(rewards)),
         }
         self.outputs.episode(
-            frame=self.frame,
+            frame=self.frame - later_steps * self.config.action_repeat,
             seconds=self.counters.seconds,
             episode=self.counters.num_episodes,
             task_return=self.returns["task"],
@@ -274,13 +353,17 @@ class Run:
         """Raises TrainingDiverged where a number is not finite."""
         bad = [name for name, value in values.items() if not np.isfinite(value)]
         if bad:
-            good = self.checkpoints.newest()
-            where = "there is none" if good is None else f"that of frame {good}"
             raise TrainingDiverged(
                 f"{', '.join(bad)} became infinite or NaN by frame {self.frame} "
                 f"(update {int(self.state.num_updates)}). Last good checkpoint: "
-                f"{where}. Lower learning_rate, or see in train.csv what grew before"
+                f"{self.newest_checkpoint()}. Lower learning_rate, or see in train.csv "
+                "what grew before"
             )
+
+    def newest_checkpoint(self) -> str:
+        """Returns a few words on it, for people."""
+        frame = self.checkpoints.newest()
+        return "there is none" if frame is None else f"that of frame {frame}"
 
     def evaluate(self) -> None:
         """Plays evaluation episodes with the mean action and writes them down."""
@@ -338,12 +421,13 @@ class Run:
         return found
 
     def is_due(self, last_step: int, every_frames: int) -> bool:
-        """Says whether that many frames have gone by, or the budget is used up.
+        """Says whether that many frames have gone by, or the run is at its end.
 
         Tested at episode ends only, hence "at least": a modulo might never be zero.
         """
         passed = (self.counters.num_steps - last_step) * self.config.action_repeat
-        return passed >= every_frames or self.frame >= self.config.total_frames
+        at_end = self.frame >= self.config.total_frames and not self.decisions
+        return passed >= every_frames or at_end
 
     def save(self) -> None:
         """Writes a checkpoint: learner, counters, and the replay's new episodes."""
@@ -364,10 +448,17 @@ class Run:
             self.save()
         self.outputs.close()
 
-    def _rng(self, stream: int) -> np.random.Generator:
-        return np.random.default_rng(
-            [self.config.seed, stream, self.counters.num_steps]
-        )
+    def close(self) -> None:
+        """Ends the processes of several environments."""
+        if self.pool is not None:
+            self.pool.close()
+
+    def _uniform_action(self, num_steps: int) -> np.ndarray:
+        rng = self._rng(_UNIFORM_ACTIONS, num_steps)
+        return rng.uniform(-1.0, 1.0, self.environment.action_spec().shape)
+
+    def _rng(self, stream: int, num_steps: int) -> np.random.Generator:
+        return np.random.default_rng([self.config.seed, stream, num_steps])
 
     def _restore_or_init(self) -> TrainState:
         if self.checkpoints.newest() is None:
@@ -397,6 +488,7 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
     Raises:
       DemonstrationError: the demonstrations can't serve this run.
       TrainingDiverged: losses or rewards are not finite any more.
+      EnvironmentsFailed: there are several, and they can't go on.
     """
 
     def say(text: str) -> None:
@@ -406,8 +498,14 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
     say(f"{config.task}: {METHODS[config.method]}, seed {config.seed}")
     run = Run(config, workdir, demonstrations, say)
     run.say = run.progress.message
-    with StopOnSignals(run.ask_to_stop):
-        run.loop()
+    with contextlib.closing(run), StopOnSignals(run.ask_to_stop):
+        try:
+            run.loop()
+        except EnvironmentsFailed as error:
+            raise EnvironmentsFailed(
+                f"{error}\nNewest checkpoint: {run.newest_checkpoint()}; the same "
+                "command goes on from there"
+            ) from error
         run.finish()
     if run.stop_asked:
         say(f"stopped at frame {run.frame}, saved; the same command goes on from there")

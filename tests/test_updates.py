@@ -19,6 +19,7 @@ from jaxil import config as jaxil_config
 from jaxil import experiment, train
 from jaxil.host.demonstrations import Demonstrations
 from jaxil.host.metrics import read_csv
+from tests.test_train import InProcessPool
 
 SIDE, STEPS, EPISODES = 12, 21, 5
 REAL_MAKE_AGENT = experiment.make_agent
@@ -115,8 +116,14 @@ def make_agent(method):
 def _nothing_is_simulated(monkeypatch):
     monkeypatch.setattr(experiment, "environment_with_seed", lambda *_: Drawing())
     monkeypatch.setattr(experiment, "make_agent", lambda c, *_: make_agent(c.method))
+    monkeypatch.setattr(experiment, "training_pool", lambda c, *_: make_pool(c))
     closeness = types.SimpleNamespace(relative_distance=lambda episodes: None)
     monkeypatch.setattr(train, "Closeness", lambda *_: closeness)
+
+
+def make_pool(config):
+    drawings = [Drawing() for _ in range(config.num_environments)]
+    return InProcessPool(drawings) if len(drawings) > 1 else None
 
 
 def make_run(folder, method="dac", **changes):
@@ -201,6 +208,52 @@ def test_groups_of_updates_end_with_the_episode_and_resume_bit_for_bit(tmp_path)
     assert _compilations(resumed.agent.repeated_step) == 1
 
 
+def test_several_environments_resume_bit_for_bit_and_count_as_one(tmp_path):
+    changes = {"num_environments": 2, "updates_per_dispatch": 4}
+    unbroken = finished(make_run(tmp_path / "unbroken", **changes))
+    table = read_csv(tmp_path / "unbroken" / "train.csv")
+    assert table["frame"].tolist() == [STEPS * n for n in range(1, EPISODES + 1)]
+    assert table["episode"].tolist() == list(range(EPISODES))
+    assert np.all(np.diff(table["seconds"]) >= 0)
+    # One environment has learned since its first episode, two since their first ones.
+    assert unbroken.state.num_updates == STEPS * (EPISODES - 2)
+
+    broken = make_run(tmp_path / "broken", **changes)
+    act = broken.act_together
+
+    def act_until_killed(observations):
+        broken.stop_asked = broken.counters.num_steps == 2 * STEPS + 18
+        return act(observations)
+
+    broken.act_together = act_until_killed
+    broken.loop()  # and no `finish`, as after a kill
+    broken.outputs.close()
+    assert broken.counters.num_steps == 2 * STEPS + 20
+    resumed = make_run(tmp_path / "broken", **changes)
+    assert resumed.counters.num_steps == 2 * STEPS
+    finished(resumed)
+    assert_same("broken", "unbroken", tmp_path)
+    assert_same_params(resumed, unbroken)
+    assert _compilations(resumed.agent.explore_together) == 1
+
+
+def test_actions_of_several_are_those_of_each_with_noise_of_its_own_step(tmp_path):
+    run = make_run(tmp_path, num_environments=3, exploration_steps=10)
+    drawings = [Drawing() for _ in range(3)]
+    seen = np.stack([d.reset(n).observation for n, d in enumerate(drawings)])
+    for first in (4, 9, 20):  # uniform, both, the policy's
+        run.counters.num_steps = first
+        together = run.act_together(seen)
+        for place, observation in enumerate(seen):
+            run.counters.num_steps = first + place
+            alone = run.act(observation)
+            np.testing.assert_allclose(together[place], alone, rtol=0, atol=1e-5)
+    assert len(np.unique(together)) == together.size
+    # Fewer than there may be, at a run's end, act alike.
+    run.counters.num_steps = 20
+    np.testing.assert_array_equal(run.act_together(seen[:2]), together[:2])
+
+
 def assert_mirrored(run):
     replay = run.replay
     for number in range(replay.oldest_episode, replay.num_episodes_added):
@@ -225,8 +278,9 @@ def _compilations(step: Any) -> int:
 
 def test_settings_of_speed_are_checked_at_the_door():
     config = jaxil_config.default_config("pdac", "walker_walk")
-    config.update(updates_per_dispatch=0, compute_dtype="float16")
+    config.update(updates_per_dispatch=0, compute_dtype="float16", num_environments=65)
     faults = jaxil_config.problems(config, ("walker_walk",))
-    assert len(faults) == 2
+    assert len(faults) == 3
     assert "compute_dtype='float16' is unknown; choose one of: float32" in faults[0]
     assert "updates_per_dispatch=0 must lie in [1, 1000]" in faults[1]
+    assert "num_environments=65 must lie in [1, 64]" in faults[2]

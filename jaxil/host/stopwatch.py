@@ -32,3 +32,13 @@ class TimedEnvironment:
         self.reset = stopwatch.timed("environment", environment.reset)
         self.step = stopwatch.timed("environment", environment.step)
         self.single_observation = environment.single_observation
+
+
+class TimedPool:
+    """A pool whose processes' time, as far as one waits for it, is "environment"."""
+
+    def __init__(self, pool: Any, stopwatch: Stopwatch) -> None:
+        self.size = pool.size
+        self.reset = stopwatch.timed("environment", pool.reset)
+        self.step = stopwatch.timed("environment", pool.step)
+        self.receive = stopwatch.timed("environment", pool.receive)

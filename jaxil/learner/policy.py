@@ -12,6 +12,7 @@ from jaxil.maths.types import Data, Params
 from jaxil.networks.agent import AgentNetworks, apply
 
 Explore = Callable[[Params, Params, Data, Array, Data], Array]
+ExploreTogether = Callable[[Params, Params, Data, Array, Data], Array]
 Exploit = Callable[[Params, Params, Data], Array]
 
 
@@ -39,6 +40,22 @@ def make_explore(networks: AgentNetworks, exploration_std: optax.Schedule) -> Ex
         )
 
     return explore
+
+
+def make_explore_together(
+    networks: AgentNetworks, exploration_std: optax.Schedule
+) -> ExploreTogether:
+    """Returns the policy that gathers experience in several environments at once.
+
+    (encoder params, actor params, observations [E, H, W, C], key, num_steps [E]) ->
+    actions [E, A]: those of `make_explore`, each with the noise of its own agent step.
+
+    Args:
+      networks: the agent's.
+      exploration_std: standard deviation by agent step.
+    """
+    explore = make_explore(networks, exploration_std)
+    return jax.vmap(explore, in_axes=(None, None, 0, None, 0))
 
 
 def make_exploit(networks: AgentNetworks) -> Exploit:

@@ -1,5 +1,6 @@
 """All parts of a run, timed and weighed one after the other, then the loop."""
 
+import contextlib
 import pathlib
 import resource
 import sys
@@ -47,8 +48,9 @@ def measure(
         bench = make_bench(
             config, pathlib.Path(folder), demonstrations, steps=steps, say=_say
         )
-        parts, ranges = _time_parts(bench, repeats)
-        results = {**parts, **_time_loop(bench), **_memory(bench)}
+        with contextlib.closing(bench.run):
+            parts, ranges = _time_parts(bench, repeats)
+            results = {**parts, **_time_loop(bench), **_memory(bench)}
         results |= arithmetic.count(bench, results["update_ms"])
         results |= _whole_run(config, results, len(bench.episode.actions))
         results |= _before_the_first_step(config, bench, environment)
@@ -102,13 +104,18 @@ def _time_parts(
 
 
 def _physics_step(config: Config) -> Callable[[], Any]:
-    config = config.copy_and_resolve_references()
-    with config.unlocked():
-        config.observation = "state"  # which draws nothing
-    environment = experiment.training_environment(config)
+    # State vectors are read, nothing is drawn.
+    environment = experiment.training_environment(_with(config, observation="state"))
     environment.reset(episode=0)
     action = np.zeros(environment.action_spec().shape)
     return lambda: environment.step(action)
+
+
+def _with(config: Config, **changes: Any) -> Config:
+    config = config.copy_and_resolve_references()
+    with config.unlocked():
+        config.update(changes)
+    return config
 
 
 def _time_loop(bench: Bench) -> dict[str, float]:
@@ -133,6 +140,8 @@ def _before_the_first_step(
     names = ("start_seconds", "compile_cold_seconds", "compile_warm_seconds")
     if environment is None:
         return dict.fromkeys(names)
+    # A single environment steps in the process that is watched.
+    config = _with(config, num_environments=1)
     started = start.seconds_to_first_step(config, environment, _say)
     return dict(zip(names, (started, *compiling.cold_and_warm(bench.lower_update))))
 
