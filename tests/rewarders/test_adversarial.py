@@ -9,26 +9,15 @@ import numpy as np
 import optax
 import pytest
 
-from jaxil.learner.state import LearnerParams
 from jaxil.maths.types import Episode, ExpertBatch
-from jaxil.networks.agent import apply, critic_features, make_agent_networks
+from jaxil.networks.agent import apply, critic_features
 from jaxil.networks.discriminator import Discriminator
 from jaxil.rewarders.adversarial import make_adversarial_rewarder
-from jaxil.rewarders.rewarder import AgentView, Spec
+from jaxil.rewarders.rewarder import AgentView
+from tests.tiny_agent import NETWORKS, make_params, make_spec, random_frames
 
-SIDE, STEPS, BATCH = 12, 5, 8
-NETWORKS = make_agent_networks(
-    action_dim=2,
-    feature_dim=5,
-    hidden_dim=6,
-    observation="pixels",
-    channels=(4,),
-    kernel_sizes=(4,),
-    strides=(4,),
-    contrast=1.0,
-    mean=0.5,
-)
-SPEC = Spec(2, 5, 2, expert_steps=4, observation_shape=(SIDE, SIDE, 3))
+STEPS, BATCH = 5, 8
+SPEC = make_spec(expert_steps=4)
 
 
 @functools.cache
@@ -46,22 +35,6 @@ def make_rewarder(frame_stack=1, sees_actions=False, shift_padding=0):
     return rewarder._replace(
         rewards=jax.jit(rewarder.rewards), update=jax.jit(rewarder.update)
     )
-
-
-@functools.cache
-def make_params(seed, frame_stack=1):
-    keys = jax.random.split(jax.random.key(seed), 3)
-    images = jnp.zeros((1, SIDE, SIDE, 3 * frame_stack), jnp.uint8)
-    encoder = NETWORKS.encoder.init(keys[0], images)
-    z = apply(NETWORKS.encoder, encoder, images)
-    actor = NETWORKS.actor.init(keys[1], z)
-    critic = NETWORKS.critic.init(keys[2], z, jnp.zeros((1, 2)))
-    return LearnerParams(encoder, actor, critic)
-
-
-def random_frames(seed, count, low=0, high=256):
-    rng = np.random.default_rng(seed)
-    return rng.integers(low, high, (count, SIDE, SIDE, 3), dtype=np.uint8)
 
 
 def random_actions(seed, count):
@@ -170,7 +143,7 @@ def test_reads_the_critics_trunk_and_nothing_of_the_actor():
 
 def test_expert_above_zero_above_agent_after_learning():
     rewarder, params = make_rewarder(), make_params(0)
-    dark, bright = random_frames(0, 64, 0, 100), random_frames(1, 64, 156, 256)
+    dark, bright = random_frames(0, 64, high=100), random_frames(1, 64, low=156)
     actions = np.zeros((64, 2), np.float32)
     # The sign must follow from the labels, not from what is bright.
     for expert, agent in ((bright, dark), (dark, bright)):

@@ -7,27 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxil.learner.state import LearnerParams
 from jaxil.maths.types import Episode, ExpertBatch, Window
-from jaxil.networks.agent import make_agent_networks
 from jaxil.rewarders.dac import make_dac_rewarder
-from jaxil.rewarders.rewarder import AgentView, Spec
+from jaxil.rewarders.rewarder import AgentView
+from tests.tiny_agent import NETWORKS, NOBODY, SIDE, make_spec
 
-SIDE, STACK, BATCH = 12, 2, 8
-SHAPE = (SIDE, SIDE, 3 * STACK)
-SPEC = Spec(2, 5, num_demonstrations=2, expert_steps=4, observation_shape=SHAPE)
-NETWORKS = make_agent_networks(
-    action_dim=2,
-    feature_dim=5,
-    hidden_dim=6,
-    observation="pixels",
-    channels=(4,),
-    kernel_sizes=(4,),
-    strides=(4,),
-    contrast=1.0,
-    mean=0.5,
-)
-NOBODY = LearnerParams(None, None, None)  # the discriminator shares nothing
+STACK, BATCH = 2, 8
+SPEC = make_spec(expert_steps=4, frame_stack=STACK)
+SHAPE = SPEC.observation_shape
 
 
 @functools.cache

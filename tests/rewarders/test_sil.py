@@ -6,30 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxil.learner.state import LearnerParams
-from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes
-from jaxil.networks.agent import make_agent_networks
+from jaxil.maths.types import ExpertBatch, ExpertEpisodes
 from jaxil.rewarders.matching import make_matching
-from jaxil.rewarders.rewarder import AgentView, Spec
+from jaxil.rewarders.rewarder import AgentView
 from jaxil.rewarders.sil import batch_distance, make_sil_rewarder
+from tests.tiny_agent import NETWORKS, NOBODY, make_episode, make_spec, random_frames
 
-SIDE, STEPS, BATCH = 12, 5, 8
-SPEC = Spec(2, 5, 2, expert_steps=STEPS, observation_shape=(SIDE, SIDE, 3))
-NETWORKS = make_agent_networks(
-    action_dim=2,
-    feature_dim=5,
-    hidden_dim=6,
-    observation="pixels",
-    channels=(4,),
-    kernel_sizes=(4,),
-    strides=(4,),
-    contrast=1.0,
-    mean=0.5,
-)
+STEPS, BATCH = 5, 8
+SPEC = make_spec(expert_steps=STEPS)
 MATCHING = make_matching(
     cost="cosine", alignment="transport", epsilon=0.05, num_iterations=200
 )
-NOBODY = LearnerParams(None, None, None)
 
 
 @functools.cache
@@ -48,18 +35,8 @@ def make_rewarder():
     )
 
 
-def draw(seed, *shape):
-    rng = np.random.default_rng(seed)
-    return rng.integers(0, 256, (*shape, SIDE, SIDE, 3), dtype=np.uint8)
-
-
-def make_episode(frames):
-    steps = len(frames) - 1
-    return Episode(frames, np.zeros((steps, 2), np.float32), np.zeros(steps))
-
-
 def make_experts():
-    frames = draw(50, 2, STEPS + 1)
+    frames = random_frames(50, 2, STEPS + 1)
     return ExpertEpisodes(frames, np.full(2, STEPS + 1), np.zeros((2, 0, 0)))
 
 
@@ -86,12 +63,12 @@ def climb(state, agent, expert, steps):
 
 
 def test_the_embedding_learns_to_tell_apart():
-    _, distances = climb(start(), draw(0, BATCH), draw(1, BATCH), 40)
+    _, distances = climb(start(), random_frames(0, BATCH), random_frames(1, BATCH), 40)
     assert distances[-1] > distances[0] + 0.1
 
 
 def test_rewards_fall_where_the_embedding_has_learned():
-    frames, experts = draw(2, STEPS + 1), make_experts()
+    frames, experts = random_frames(2, STEPS + 1), make_experts()
     state = start().replace(scale=jnp.ones(()))
 
     def total(state):
@@ -131,12 +108,12 @@ def test_the_gradient_is_that_of_the_distance():
 def test_the_first_episode_returns_minus_ten_and_the_scale_stays():
     rewarder, experts = make_rewarder(), make_experts()
     rewards, state = rewarder.rewards(
-        start(), NOBODY, make_episode(draw(3, STEPS + 1)), experts
+        start(), NOBODY, make_episode(random_frames(3, STEPS + 1)), experts
     )
     assert rewards.shape == (STEPS,)
     np.testing.assert_allclose(jnp.sum(rewards), -10.0, rtol=1e-4)
     other, later = rewarder.rewards(
-        state, NOBODY, make_episode(draw(4, STEPS + 1)), experts
+        state, NOBODY, make_episode(random_frames(4, STEPS + 1)), experts
     )
     assert later.scale == state.scale
     assert not np.isclose(jnp.sum(other), -10.0)

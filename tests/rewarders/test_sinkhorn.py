@@ -9,33 +9,22 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from jaxil.learner.state import LearnerParams
 from jaxil.maths import augmentation, transport
-from jaxil.maths.types import Episode, ExpertEpisodes
-from jaxil.networks.agent import actor_features, apply, make_agent_networks
+from jaxil.maths.types import ExpertEpisodes
+from jaxil.networks.agent import actor_features
 from jaxil.rewarders.matching import closest_rewards, make_matching
-from jaxil.rewarders.rewarder import Spec
 from jaxil.rewarders.sinkhorn import make_sinkhorn_rewarder
+from tests.tiny_agent import (
+    NETWORKS,
+    SIDE,
+    make_episode,
+    make_params,
+    make_spec,
+    random_frames,
+)
 
-SIDE, STEPS, EXPERT_STEPS, K = 12, 6, 5, 3
-NETWORKS = make_agent_networks(
-    action_dim=2,
-    feature_dim=5,
-    hidden_dim=6,
-    observation="pixels",
-    channels=(4,),
-    kernel_sizes=(4,),
-    strides=(4,),
-    contrast=1.0,
-    mean=0.5,
-)
-SPEC = Spec(
-    action_dim=2,
-    feature_dim=5,
-    num_demonstrations=K,
-    expert_steps=EXPERT_STEPS,
-    observation_shape=(SIDE, SIDE, 3),
-)
+STEPS, EXPERT_STEPS, K = 6, 5, 3
+SPEC = make_spec(num_demonstrations=K, expert_steps=EXPERT_STEPS)
 
 
 @functools.cache
@@ -50,27 +39,6 @@ def make_rewarder(frame_stack=1, target_update_steps=20):
         frame_stack=frame_stack,
     )
     return rewarder._replace(rewards=jax.jit(rewarder.rewards))
-
-
-@functools.cache
-def make_params(seed, frame_stack=1):
-    keys = jax.random.split(jax.random.key(seed), 3)
-    images = jnp.zeros((1, SIDE, SIDE, 3 * frame_stack), jnp.uint8)
-    encoder = NETWORKS.encoder.init(keys[0], images)
-    z = apply(NETWORKS.encoder, encoder, images)
-    actor = NETWORKS.actor.init(keys[1], z)
-    critic = NETWORKS.critic.init(keys[2], z, jnp.zeros((1, 2)))
-    return LearnerParams(encoder, actor, critic)
-
-
-def random_frames(seed, *shape):
-    rng = np.random.default_rng(seed)
-    return rng.integers(0, 256, (*shape, SIDE, SIDE, 3), dtype=np.uint8)
-
-
-def make_episode(frames):
-    steps = len(frames) - 1
-    return Episode(frames, np.zeros((steps, 2), np.float32), np.zeros(steps))
 
 
 def make_experts(seed=50):
