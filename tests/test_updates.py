@@ -252,6 +252,7 @@ def test_actions_of_several_are_those_of_each_with_noise_of_its_own_step(tmp_pat
     # Fewer than there may be, at a run's end, act alike.
     run.counters.num_steps = 20
     np.testing.assert_array_equal(run.act_together(seen[:2]), together[:2])
+    run.outputs.close()
 
 
 def assert_mirrored(run):
