@@ -10,6 +10,8 @@ from jax import Array
 
 from jaxil.maths import transport
 
+_COST_FLOOR = 1e-8  # keeps the scale finite if the first episode costs nothing
+
 
 class Matching(NamedTuple):
     """How two episodes are compared: what a pair of moments costs, which are paired.
@@ -35,6 +37,32 @@ class Matching(NamedTuple):
           Rewards of the agent's T observations, see `closest_rewards`. Shape [T].
         """
         return closest_rewards(*self._costs_and_plans(agent, experts, num_moments))
+
+    def scaled_rewards(
+        self,
+        agent: Array,
+        experts: Array,
+        num_moments: Array,
+        *,
+        scale: Array,
+        return_scale: float,
+    ) -> tuple[Array, Array]:
+        """Returns rewards of an episode's transitions, and the scale that they have.
+
+        Args:
+          agent: features of o_0 ... o_T. Shape [T + 1, D].
+          experts: see `rewards`.
+          num_moments: see `rewards`.
+          scale: the one that is in force; 0 before the first episode. Shape [].
+          return_scale: minus the first episode's return; 10 in the paper.
+
+        Returns:
+          Rewards, of which the t-th is that of o_{t+1}, shape [T], and the scale that
+          is in force from now on, shape [].
+        """
+        unscaled = self.rewards(agent, experts, num_moments)[1:]
+        scale = scale_of_first_episode(scale, unscaled, return_scale)
+        return scale * unscaled, scale
 
     def closest_plan(self, agent: Array, experts: Array, num_moments: Array) -> Array:
         """Returns the plan behind `rewards`. Shape [T, N]."""
@@ -73,6 +101,19 @@ def closest_rewards(costs: Array, plans: Array) -> Array:
     chex.assert_rank([costs, plans], 3)
     candidates = jax.vmap(transport.transport_rewards)(costs, plans)
     return candidates[jnp.argmax(jnp.sum(candidates, axis=1))]
+
+
+def scale_of_first_episode(scale: Array, unscaled: Array, return_scale: float) -> Array:
+    """Returns the factor that gives the first episode the return `-return_scale`.
+
+    Args:
+      scale: the one that is in force; 0 before the first episode. Shape [].
+      unscaled: rewards of an episode. Shape [T].
+      return_scale: 10 in the paper.
+    """
+    chex.assert_rank([scale, unscaled], [0, 1])
+    first = return_scale / jnp.maximum(-jnp.sum(unscaled), _COST_FLOOR)
+    return jnp.where(scale > 0.0, scale, first)
 
 
 def make_matching(

@@ -19,7 +19,6 @@ from jaxil.networks.agent import AgentNetworks, apply
 from jaxil.networks.discriminator import Embedding
 from jaxil.rewarders.matching import Matching
 from jaxil.rewarders.rewarder import AgentView, Rewarder, Spec
-from jaxil.rewarders.sinkhorn import scale_of_first_episode
 
 
 class SilState(struct.PyTreeNode):
@@ -117,9 +116,14 @@ def make_sil_rewarder(
         del learner
         assert expert_episodes is not None
         mine, experts = features(state, episode, expert_episodes)
-        unscaled = matching.rewards(mine, experts, expert_episodes.num_frames)[1:]
-        scale = scale_of_first_episode(state.scale, unscaled, return_scale)
-        return scale * unscaled, state.replace(scale=scale)
+        rewards, scale = matching.scaled_rewards(
+            mine,
+            experts,
+            expert_episodes.num_frames,
+            scale=state.scale,
+            return_scale=return_scale,
+        )
+        return rewards, state.replace(scale=scale)
 
     def plan(
         state: SilState,

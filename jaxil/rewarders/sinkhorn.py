@@ -1,6 +1,5 @@
 """P-SIL: rewards from optimal transport to the closest demonstration."""
 
-import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -12,8 +11,6 @@ from jaxil.maths.types import Episode, ExpertEpisodes, Params
 from jaxil.networks.agent import AgentNetworks, actor_features
 from jaxil.rewarders.matching import Matching
 from jaxil.rewarders.rewarder import Rewarder, Spec, keep_state
-
-_COST_FLOOR = 1e-8  # keeps the scale finite if the first episode costs nothing
 
 
 class SinkhornState(struct.PyTreeNode):
@@ -113,11 +110,14 @@ def make_sinkhorn_rewarder(
             state,
         )
         features = embed(state.target_encoder, state.target_actor, episode.frames)
-        unscaled = matching.rewards(
-            features, state.expert_features, expert_episodes.num_frames
-        )[1:]
-        scale = scale_of_first_episode(state.scale, unscaled, return_scale)
-        return scale * unscaled, state.replace(scale=scale)
+        rewards, scale = matching.scaled_rewards(
+            features,
+            state.expert_features,
+            expert_episodes.num_frames,
+            scale=state.scale,
+            return_scale=return_scale,
+        )
+        return rewards, state.replace(scale=scale)
 
     def plan(
         state: SinkhornState,
@@ -140,16 +140,3 @@ def make_sinkhorn_rewarder(
         summary=lambda state: {"sinkhorn/scale": state.scale},
         plan=plan,
     )
-
-
-def scale_of_first_episode(scale: Array, unscaled: Array, return_scale: float) -> Array:
-    """Returns the factor that gives the first episode the return `-return_scale`.
-
-    Args:
-      scale: the one that is in force; 0 before the first episode. Shape [].
-      unscaled: rewards of an episode. Shape [T].
-      return_scale: 10 in the paper.
-    """
-    chex.assert_rank([scale, unscaled], [0, 1])
-    first = return_scale / jnp.maximum(-jnp.sum(unscaled), _COST_FLOOR)
-    return jnp.where(scale > 0.0, scale, first)

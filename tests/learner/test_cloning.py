@@ -11,22 +11,12 @@ from jaxil.learner.policy import make_exploit
 from jaxil.learner.update import Learner, init_train_state
 from jaxil.maths import losses
 from jaxil.maths.types import ExpertBatch
-from jaxil.networks.agent import make_agent_networks
 from jaxil.rewarders.rewarder import Spec
 from jaxil.rewarders.task import make_zero_rewarder
+from tests.tiny_agent import make_tiny_networks
 
 SHAPE = (12, 12, 3)
-NETWORKS = make_agent_networks(
-    action_dim=2,
-    feature_dim=8,
-    hidden_dim=32,
-    observation="pixels",
-    channels=(8,),
-    kernel_sizes=(4,),
-    strides=(4,),
-    contrast=1.0,
-    mean=0.5,
-)
+NETWORKS = make_tiny_networks(feature_dim=8, hidden_dim=32, channels=(8,))
 
 
 def make_learner(shift_padding=0):

@@ -9,21 +9,12 @@ import numpy as np
 import optax
 
 from jaxil.learner.policy import make_exploit, make_explore
-from jaxil.networks.agent import apply, make_agent_networks
+from jaxil.networks.agent import apply
+from tests.tiny_agent import make_tiny_networks
 
 with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
 
-NETWORKS = make_agent_networks(
-    action_dim=3,
-    feature_dim=5,
-    hidden_dim=8,
-    observation="pixels",
-    channels=(4,),
-    kernel_sizes=(3,),
-    strides=(2,),
-    contrast=1.0,
-    mean=0.5,
-)
+NETWORKS = make_tiny_networks(action_dim=3)
 SCHEDULE = optax.linear_schedule(1.0, 0.0, 1000)
 
 

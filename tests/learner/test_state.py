@@ -13,25 +13,15 @@ from jaxil.learner.state import (
 )
 from jaxil.learner.update import Learner, init_train_state, make_update_step
 from jaxil.maths.types import Batch
-from jaxil.networks.agent import make_agent_networks
 from jaxil.rewarders.rewarder import Spec
 from jaxil.rewarders.task import make_task_rewarder
+from tests.tiny_agent import make_tiny_networks
 
 SPEC = Spec(2, 5, num_demonstrations=0, expert_steps=0, observation_shape=(12, 12, 6))
 
 
 def tiny_learner():
-    networks = make_agent_networks(
-        action_dim=2,
-        feature_dim=5,
-        hidden_dim=8,
-        observation="state",
-        channels=(),
-        kernel_sizes=(),
-        strides=(),
-        contrast=1.0,
-        mean=0.5,
-    )
+    networks = make_tiny_networks(observation="state")
     return Learner(
         networks=networks,
         rewarder=make_task_rewarder(),

@@ -12,12 +12,13 @@ import pytest
 
 from jaxil.learner.update import Learner, init_train_state, make_update_step
 from jaxil.maths.types import Batch, Episode, ExpertBatch, ExpertEpisodes, Window
-from jaxil.networks.agent import apply, critic_features, make_agent_networks
+from jaxil.networks.agent import apply, critic_features
 from jaxil.rewarders.adversarial import make_adversarial_rewarder
 from jaxil.rewarders.matching import make_matching
 from jaxil.rewarders.rewarder import Rewarder, Spec
 from jaxil.rewarders.sinkhorn import make_sinkhorn_rewarder
 from jaxil.rewarders.task import make_task_rewarder
+from tests.tiny_agent import make_tiny_networks
 
 SIDE, CHANNELS, ACTIONS, BATCH, PADDING = 12, 6, 2, 8, 2
 TAU, NOISE_CLIP, LEARNING_RATE = 0.05, 0.3, 3e-3
@@ -29,16 +30,12 @@ SPEC = Spec(
     observation_shape=(SIDE, SIDE, CHANNELS),
 )
 SCHEDULE = optax.linear_schedule(1.0, 0.0, 10)
-NETWORKS = make_agent_networks(
+NETWORKS = make_tiny_networks(
     action_dim=ACTIONS,
-    feature_dim=5,
     hidden_dim=8,
-    observation="pixels",
     channels=(4, 4),
     kernel_sizes=(3, 3),
     strides=(2, 1),
-    contrast=1.0,
-    mean=0.5,
 )
 
 

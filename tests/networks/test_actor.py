@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxil.networks.actor import Actor
-from jaxil.networks.agent import actor_features, apply, make_agent_networks
+from jaxil.networks.agent import actor_features, apply
 from jaxil.networks.layers import MLP, Trunk
+from tests.tiny_agent import NETWORKS
 
 with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
 
@@ -111,21 +112,10 @@ def test_dense_layers_start_orthogonal_with_bias_zero():
 
 
 def test_actor_features_are_the_trunk_on_the_encoder():
-    networks = make_agent_networks(
-        action_dim=2,
-        feature_dim=5,
-        hidden_dim=6,
-        observation="pixels",
-        channels=(4,),
-        kernel_sizes=(3,),
-        strides=(2,),
-        contrast=1.0,
-        mean=0.5,
-    )
     images = np.random.default_rng(0).integers(0, 256, (3, 12, 12, 3), dtype=np.uint8)
-    encoder = networks.encoder.init(jax.random.key(0), images)
-    representation = apply(networks.encoder, encoder, images)
-    actor = networks.actor.init(jax.random.key(1), representation)
+    encoder = NETWORKS.encoder.init(jax.random.key(0), images)
+    representation = apply(NETWORKS.encoder, encoder, images)
+    actor = NETWORKS.actor.init(jax.random.key(1), representation)
     trunk = apply(Trunk(5), {"params": actor["params"]["trunk"]}, representation)
-    features = actor_features(networks, encoder, actor, jnp.asarray(images))
+    features = actor_features(NETWORKS, encoder, actor, jnp.asarray(images))
     np.testing.assert_allclose(features, trunk, atol=1e-6)

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxil.networks.agent import apply, critic_features, make_agent_networks
+from jaxil.networks.agent import apply, critic_features
 from jaxil.networks.critic import Critic
 from jaxil.networks.layers import MLP, Trunk
+from tests.tiny_agent import NETWORKS, make_tiny_networks
 
 with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
 
@@ -77,38 +78,17 @@ class CriticTest(chex.TestCase):
 
 
 def test_features_of_agent_networks_are_the_critics_and_not_the_actors():
-    networks = make_agent_networks(
-        action_dim=2,
-        feature_dim=5,
-        hidden_dim=6,
-        observation="pixels",
-        channels=(4,),
-        kernel_sizes=(3,),
-        strides=(2,),
-        contrast=1.0,
-        mean=0.5,
-    )
     images = np.random.default_rng(0).integers(0, 256, (3, 12, 12, 3), dtype=np.uint8)
-    encoder = networks.encoder.init(jax.random.key(0), images)
-    representation = apply(networks.encoder, encoder, images)
-    critic = networks.critic.init(jax.random.key(1), representation, jnp.zeros((3, 2)))
+    encoder = NETWORKS.encoder.init(jax.random.key(0), images)
+    representation = apply(NETWORKS.encoder, encoder, images)
+    critic = NETWORKS.critic.init(jax.random.key(1), representation, jnp.zeros((3, 2)))
     trunk = apply(Trunk(5), {"params": critic["params"]["trunk"]}, representation)
-    features = critic_features(networks, encoder, critic, jnp.asarray(images))
+    features = critic_features(NETWORKS, encoder, critic, jnp.asarray(images))
     np.testing.assert_allclose(features, trunk, atol=1e-6)
 
 
 def test_state_vectors_reach_the_trunk_through_the_encoders_hidden_layer():
-    networks = make_agent_networks(
-        action_dim=2,
-        feature_dim=5,
-        hidden_dim=6,
-        observation="state",
-        channels=(4,),
-        kernel_sizes=(3,),
-        strides=(2,),
-        contrast=1.0,
-        mean=0.5,
-    )
+    networks = make_tiny_networks(observation="state")
     vectors = jax.random.normal(jax.random.key(0), (3, 7))
     encoder = networks.encoder.init(jax.random.key(0), vectors)
     hidden = apply(networks.encoder, encoder, vectors)
