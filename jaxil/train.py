@@ -503,8 +503,8 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
             run.loop()
         except EnvironmentsFailed as error:
             raise EnvironmentsFailed(
-                f"{error}\nNewest checkpoint: {run.newest_checkpoint()}; the same "
-                "command goes on from there"
+                f"{error}\nNewest checkpoint: {run.newest_checkpoint()}. The same "
+                "command goes on from it, or begins anew without one"
             ) from error
         run.finish()
     if run.stop_asked:

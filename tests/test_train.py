@@ -255,7 +255,7 @@ def test_the_end_of_environments_names_the_way_on(monkeypatch, tmp_path):
     config = _config(method="drqv2")
     with pytest.raises(EnvironmentsFailed, match="SIGKILL") as caught:
         train.train(config, tmp_path)
-    assert "that of frame 4000; the same command goes on" in str(caught.value)
+    assert "that of frame 4000. The same command goes on" in str(caught.value)
     assert closed
 
 
