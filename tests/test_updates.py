@@ -209,7 +209,7 @@ def test_groups_of_updates_end_with_the_episode_and_resume_bit_for_bit(tmp_path)
 
 
 def test_several_environments_resume_bit_for_bit_and_count_as_one(tmp_path):
-    changes = {"num_environments": 2, "updates_per_dispatch": 4}
+    changes: dict[str, Any] = {"num_environments": 2, "updates_per_dispatch": 4}
     unbroken = finished(make_run(tmp_path / "unbroken", **changes))
     table = read_csv(tmp_path / "unbroken" / "train.csv")
     assert table["frame"].tolist() == [STEPS * n for n in range(1, EPISODES + 1)]

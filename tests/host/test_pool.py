@@ -162,7 +162,7 @@ def test_several_processes_play_and_none_is_left():
 
     assert_counted(play(pool, 5, act))
     # Pids of seven digits are still exact in float32.
-    assert seen_pids == set(np.float32(pids))
+    assert seen_pids == {float(pid) for pid in pids}
     pool.close()
     assert not any(map(is_there, pids))
     pool.close()  # again does nothing
