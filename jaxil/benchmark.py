@@ -7,7 +7,7 @@ r"""Times and weighs every part of a run on this machine, and the loop that join
 
 Medians over repeats, after a warm-up; nothing is learned and nothing kept. Compiling
 without a cache, and starting a run, in a process of its own, are timed last; --nostart
-leaves both out, as a sweep does.
+leaves both out, as a sweep does. --full weighs memory with a full replay.
 """
 
 import json
@@ -40,7 +40,9 @@ def main(argv: list[str]) -> None:
         found = []
         for value, config in sweep.configs.items():
             print(f"{sweep.field}={value}", file=sys.stderr, flush=True)
-            results = measurement.measure(config, repeats=repeats, steps=steps)
+            results = measurement.measure(
+                config, repeats=repeats, steps=steps, full=values.full
+            )
             found.append({"sweep": {"field": sweep.field, "value": value}, **results})
         print(tables.machine_line(found[0]))
         print(tables.sweep_table(sweep.field, found))
@@ -52,6 +54,7 @@ def main(argv: list[str]) -> None:
         repeats=repeats,
         steps=steps,
         environment=environment if values.start else None,
+        full=values.full,
     )
     print(tables.results_table(results))
     if old is not None:
@@ -111,6 +114,12 @@ def _define(values: flags.FlagValues) -> None:
         "start",
         True,
         "time compiling without a cache and starting a run too",
+        flag_values=values,
+    )
+    flags.DEFINE_boolean(
+        "full",
+        False,
+        "fill the replay before memory is weighed, as in a run that is long under way",
         flag_values=values,
     )
     flags.DEFINE_integer(

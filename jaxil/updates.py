@@ -79,7 +79,7 @@ class Updates:
           The state after it, and metrics of the last update, None without any.
         """
         pending, self._pending = self._pending, []
-        frames, metrics = self._frames(), None
+        frames, metrics = self.frames(), None
         if len(pending) > 1 and len(pending) == self._config.updates_per_dispatch:
             batches = jax.tree.map(lambda *leaves: np.stack(leaves), *pending)
             return self._agent.repeated_step(state, *batches, frames)
@@ -93,6 +93,16 @@ class Updates:
         """Follows the replay, after an episode has entered it."""
         if self._mirror is not None:
             self._mirror.refresh()
+
+    def frames(self) -> Frames | None:
+        """Returns the frames that lie on the device; None where none do.
+
+        An episode that enters the replay replaces them.
+        """
+        if not self._config.replay_on_device:
+            return None
+        agent = None if self._mirror is None else self._mirror.frames
+        return Frames(agent, self._expert_frames)
 
     def draw(self, rng: np.random.Generator) -> Drawn:
         """Draws what one update learns from."""
@@ -125,9 +135,3 @@ class Updates:
             frame_stack=experiment.stack_size(self._config),
         )
         return ExpertBatch(*drawn)
-
-    def _frames(self) -> Frames | None:
-        if not self._config.replay_on_device:
-            return None
-        agent = None if self._mirror is None else self._mirror.frames
-        return Frames(agent, self._expert_frames)

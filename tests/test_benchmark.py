@@ -1,8 +1,9 @@
 """The benchmark: every part of a run has its time, and wrong use is told at once.
 
-Two tests train and compile a small learner; they take half a minute on a busy core.
+Three tests compile a small learner; they take a minute on a busy core.
 """
 
+import contextlib
 import json
 
 import jax
@@ -12,6 +13,7 @@ from jaxil import benchmark
 from jaxil import config as jaxil_config
 from jaxil.command import UsageError
 from jaxil.timing import compiling, measurement, start, sweeping, tables
+from jaxil.timing.bench import make_bench
 from tests.commands import SMALL, run
 
 _CONFIG = "--config=configs/tiny.py:pdac,ball_in_cup_catch"
@@ -125,6 +127,7 @@ def test_a_sweep_measures_each_value(tmp_path):
         "--config.updates_per_dispatch=2",
         "--repeats=1",
         "--steps=4",
+        "--full",
         "--sweep=batch_size:4,8",
         f"--json={path}",
     )
@@ -139,6 +142,20 @@ def test_a_sweep_measures_each_value(tmp_path):
     assert found[0]["update_gflop_by_hand"] * 2 == found[1]["update_gflop_by_hand"]
     rows = finished.stdout.splitlines()[-2:]
     assert [row.split()[0] for row in rows] == ["4", "8"]
+
+
+def test_a_full_replay_is_full(tmp_path):
+    config = jaxil_config.default_config("drqv2", "cartpole_swingup")
+    config.update(observation="state", hidden_dim=16, batch_size=4, action_repeat=10)
+    config.replay_size_steps = 1000
+    bench = make_bench(config, tmp_path, None, steps=2, say=print)
+    with contextlib.closing(bench.run):
+        assert bench.run.replay.num_steps_stored == 100
+        updates = int(bench.run.state.num_updates)
+        bench.fill_replay()
+        assert bench.run.replay.num_steps_stored == 1000
+        assert int(bench.run.state.num_updates) == updates + 1
+    bench.run.outputs.close()
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from jaxil.config import Config
 from jaxil.host.evaluation import evaluate
 from jaxil.host.interaction import FinishedEpisode
 from jaxil.host.progress import ProgressLine
-from jaxil.learner.gathering import Frames, gather_batch, gather_expert
+from jaxil.learner.gathering import gather_batch, gather_expert
 from jaxil.maths.types import Batch, ExpertBatch
 from jaxil.timing.parts import make_parts
 
@@ -65,12 +65,15 @@ class Bench:
         )
         self.run.updates.episode_added()
 
-    def frames(self) -> Frames | None:
-        """Returns the frames that lie on the device; None where none do.
-
-        Adding an episode replaces them.
-        """
-        return self.run.updates._frames()
+    def fill_replay(self) -> None:
+        """Stores the episode until the replay is full, then learns from all of it."""
+        run = self.run
+        for _ in range(run.config.replay_size_steps // len(self.episode.actions) + 1):
+            self.add_episode()
+        batches = run.updates.draw(np.random.default_rng(0))
+        step = run.agent.update_step
+        run.state, _ = step(run.state, *batches, run.updates.frames())
+        jax.block_until_ready(run.state)
 
     def update(self, batches: Any) -> Any:
         """Learns from as many batches as a run sends to the device at once.
@@ -81,7 +84,7 @@ class Bench:
         run = self.run
         several = run.config.updates_per_dispatch > 1
         step = run.agent.repeated_step if several else run.agent.update_step
-        run.state, run.metrics = step(run.state, *batches, self.frames())
+        run.state, run.metrics = step(run.state, *batches, self.run.updates.frames())
         return run.state
 
     def dispatched(self) -> Any:
@@ -95,7 +98,7 @@ class Bench:
         """Returns the parts of an update; see `make_parts`."""
         run, config = self.run, self.run.config
         batch, expert = jax.device_put(self.batches)
-        frames = self.frames()
+        frames = self.run.updates.frames()
         if frames is not None and batch is not None:
             batch = jax.jit(gather_batch)(frames.agent, batch)
         if frames is not None and expert is not None:
@@ -118,7 +121,7 @@ class Bench:
         """Traces one update anew, for the compiler."""
         shapes = jax.tree.map(
             lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype),
-            (self.run.state, *self.batches, self.frames()),
+            (self.run.state, *self.batches, self.run.updates.frames()),
         )
         return self.run.agent.update_step.lower(*shapes)  # pyright: ignore
 

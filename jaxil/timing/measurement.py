@@ -28,6 +28,7 @@ def measure(
     repeats: int,
     steps: int,
     environment: Mapping[str, str] | None = None,
+    full: bool = False,
 ) -> dict[str, Any]:
     """Times the parts of a run.
 
@@ -38,6 +39,7 @@ def measure(
       steps: decisions of the loop that are timed.
       environment: variables of the process in which starting is timed; None leaves
         that out, and compiling without a cache.
+      full: whether the replay is filled before memory is weighed.
 
     Returns:
       What `tables.ROWS` names, None where it does not apply; `ranges`, lowest and
@@ -50,7 +52,10 @@ def measure(
         )
         with contextlib.closing(bench.run):
             parts, ranges = _time_parts(bench, repeats)
-            results = {**parts, **_time_loop(bench), **_memory(bench)}
+            results = {**parts, **_time_loop(bench)}
+            if full:
+                bench.fill_replay()
+            results |= _memory(bench)
         results |= arithmetic.count(bench, results["update_ms"])
         results |= _whole_run(config, results, len(bench.episode.actions))
         results |= _before_the_first_step(config, bench, environment)
@@ -61,6 +66,7 @@ def measure(
         **device.describe(),
         "repeats": repeats,
         "steps": steps,
+        "full": full,
         "config": config.to_dict(),
     }
 
