@@ -72,15 +72,23 @@ def test_method_trains(method, tmp_path):
 
 
 def test_cloning_learns_without_playing(tmp_path):
-    finished = run("launch", *small_run("bc", tmp_path), "--config.total_frames=3000")
+    flags = [
+        *small_run("bc", tmp_path),
+        "--config.total_frames=3000",
+        "--config.update_every_steps=1",
+        "--config.learning_rate=3e-3",
+    ]
+    finished = run("launch", *flags)
     assert finished.returncode == 0, finished.stderr
     train = read_csv(tmp_path / "train.csv")
-    assert train["actor/loss"][-1] < train["actor/loss"][0]
+    # Of an actor that does nothing, where the expert pushes with full force, at a
+    # standard deviation of 0.1: 1 / (2 * 0.1^2) - 1.4, about 45 in the mean.
+    assert train["actor/loss"][-1] < 10
     assert not np.any(np.isfinite(train["task_return"]))
     evals = read_csv(tmp_path / "eval.csv")
     np.testing.assert_array_equal(evals["frame"], [2000, 3000])
     before = (tmp_path / "eval.csv").read_text()
-    again = run("launch", *small_run("bc", tmp_path), "--config.total_frames=3000")
+    again = run("launch", *flags)
     assert again.returncode == 0
     assert (tmp_path / "eval.csv").read_text() == before
 
