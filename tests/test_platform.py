@@ -36,6 +36,8 @@ def _clean_environment(monkeypatch, tmp_path):
     monkeypatch.setattr(platform, "_version", lambda package: "0.10.2")
     monkeypatch.setattr(platform, "uses_cpu", lambda: True)
     monkeypatch.setattr(platform, "_tell_imported_jax", lambda: None)
+    # Can't be undone; the tests of it have processes of their own.
+    monkeypatch.setattr(platform, "_keep_freed_memory", lambda: None)
 
 
 def test_prepare_chooses_what_nobody_chose(tmp_path):
@@ -235,3 +237,41 @@ MEMINFO = {"proc/meminfo": "MemTotal:  2000 kB\nMemAvailable:    1000 kB\n"}
 )
 def test_the_tightest_limit_counts(tmp_path, files, expected):
     assert platform.available_memory_bytes(machine(tmp_path, files)) == expected
+
+
+_NEW_PAGES = """
+import resource
+from jaxil import platform
+platform._keep_freed_memory()
+block = bytearray(2**26)
+del block
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(4):
+    block = bytearray(2**26)
+    del block
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+def _new_pages(**variables: str) -> int:
+    """Returns the pages that four blocks of 64 MB cost, after a first one."""
+    environment = {**os.environ, **variables}
+    finished = subprocess.run(
+        [sys.executable, "-c", _NEW_PAGES],
+        env=environment,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    return int(finished.stdout)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="mallopt is glibc's")
+def test_freed_memory_is_used_again():
+    assert _new_pages() < 1_000
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="mallopt is glibc's")
+def test_the_users_own_allocator_settings_stay():
+    # 4 blocks of 16384 pages each, asked for anew (fewer if pages are huge).
+    assert _new_pages(MALLOC_ARENA_MAX="8") > 2 * _new_pages()

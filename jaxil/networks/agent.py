@@ -8,7 +8,7 @@ from jax import Array
 from jaxil.maths.types import Params
 from jaxil.networks.actor import Actor
 from jaxil.networks.critic import Critic
-from jaxil.networks.encoder import PixelEncoder, StateEncoder
+from jaxil.networks.encoder import PixelEncoder, StateEncoder, encode
 
 
 class AgentNetworks(NamedTuple):
@@ -31,6 +31,7 @@ def make_agent_networks(
     contrast: float,
     mean: Any,
     compute_dtype: str = "float32",
+    chunk_size: int = 0,
 ) -> AgentNetworks:
     """Returns the networks of DrQ-v2.
 
@@ -46,12 +47,15 @@ def make_agent_networks(
       mean: see `PixelEncoder`.
       compute_dtype: "float32" or "bfloat16", of the convolutions and of the product
         that follows them.
+      chunk_size: see `PixelEncoder`.
     """
     dtype = jnp.dtype(compute_dtype)
     if observation == "state":
         encoder = StateEncoder(hidden_dim)
     else:
-        encoder = PixelEncoder(channels, kernel_sizes, strides, contrast, mean, dtype)
+        encoder = PixelEncoder(
+            channels, kernel_sizes, strides, contrast, mean, dtype, chunk_size
+        )
     return AgentNetworks(
         encoder=encoder,
         actor=Actor(action_dim, feature_dim, hidden_dim, dtype),
@@ -71,7 +75,7 @@ def actor_features(
     observation: Array,
 ) -> Array:
     """Returns trunk features of the actor. [B, H, W, C] to [B, D]."""
-    representation = apply(networks.encoder, encoder_params, observation)
+    representation = encode(networks.encoder, encoder_params, observation)
     actor = networks.actor
     return apply(actor, actor_params, representation, method=actor.features)
 
@@ -83,6 +87,6 @@ def critic_features(
     observation: Array,
 ) -> Array:
     """Returns trunk features of the critic. [B, H, W, C] to [B, D]."""
-    representation = apply(networks.encoder, encoder_params, observation)
+    representation = encode(networks.encoder, encoder_params, observation)
     critic = networks.critic
     return apply(critic, critic_params, representation, method=critic.features)

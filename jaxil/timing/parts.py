@@ -16,6 +16,7 @@ from jaxil.learner.state import TrainState, apply_gradients
 from jaxil.maths import augmentation, distributions, losses
 from jaxil.maths.types import Batch, Data, ExpertBatch, Params
 from jaxil.networks.agent import AgentNetworks, apply
+from jaxil.networks.encoder import encode
 from jaxil.rewarders.rewarder import AgentView, Rewarder
 
 _STD = 0.1  # of exploration; its value costs nothing
@@ -59,8 +60,8 @@ def make_parts(
     def augment(observation: Data) -> Array:
         return augmentation.augment(observation, key, padding=shift_padding)
 
-    def encode(params: Params, observation: Data) -> Array:
-        return apply(encoder, params, augment(observation))
+    def see(params: Params, observation: Data) -> Array:
+        return encode(encoder, params, augment(observation))
 
     def explore(params: Params, representation: Array) -> Array:
         mean = jnp.tanh(apply(actor, params, representation))
@@ -70,10 +71,10 @@ def make_parts(
 
     @jax.jit
     def run_encoder(params: Params, seen: Any, cotangent: Array) -> Any:
-        _, pull_back = jax.vjp(lambda p: encode(p, seen.observation), params)
+        _, pull_back = jax.vjp(lambda p: see(p, seen.observation), params)
         following = None
         if isinstance(seen, Batch):
-            following = encode(params, seen.next_observation)
+            following = see(params, seen.next_observation)
         return pull_back(cotangent), following
 
     @jax.jit
@@ -117,7 +118,7 @@ def make_parts(
         )
         return rewarder.update(state.rewarder, state.params, agent, e, key), rewards
 
-    representation = jax.jit(encode)(params.encoder, seen.observation)
+    representation = jax.jit(see)(params.encoder, seen.observation)
     functions: dict[str, Callable[[], Any]] = {
         "encoder": lambda: run_encoder(params.encoder, seen, representation),
         "optimiser": _optimiser_step(state, learning_rate, critic_target_tau),

@@ -1,4 +1,4 @@
-"""The matrix form of a convolution against XLA's own, in value and gradient."""
+"""Our convolution against XLA's own, in value, gradient and gradient of gradient."""
 
 from typing import Any
 
@@ -69,11 +69,20 @@ class ConvolveTest(chex.TestCase):
         value = self.variant(lambda x, w: ours(x, w, strides))(images, kernel)
         np.testing.assert_allclose(value, reference(images, kernel, strides), atol=1e-4)
 
-    def test_patches_are_ordered_as_a_kernel_is(self):
-        # One window as large as the image: the patch is the image, read in order.
-        images = jnp.arange(2.0 * 3 * 4 * 2).reshape(2, 3, 4, 2)
-        patches = convolution.gather_patches(images, (3, 4), (1, 2))
-        np.testing.assert_array_equal(patches, images.reshape(2, 1, 1, 24))
+    def test_kernel_gradient_by_hand(self):
+        # One window as large as the image, so each weight meets just one pixel.
+        images = jnp.arange(12.0).reshape(1, 2, 3, 2)
+        gradient = convolution.kernel_gradient(
+            images, jnp.full((1, 1, 1, 1), 2.0), (1, 1), (2, 3)
+        )
+        np.testing.assert_array_equal(gradient[..., 0], 2.0 * images[0])
+
+    def test_image_gradient_by_hand(self):
+        # Windows of 2 at a stride of 3 see every pixel but each third one.
+        kernel = jnp.asarray([1.0, 10.0]).reshape(1, 2, 1, 1)
+        cotangent = jnp.asarray([1.0, 2.0]).reshape(1, 1, 2, 1)
+        gradient = convolution.image_gradient(cotangent, kernel, (1, 3), (1, 6))
+        np.testing.assert_array_equal(gradient.reshape(-1), [1, 10, 0, 2, 20, 0])
 
     def test_gradients_of_gradients_equal_xla(self):
         # As a gradient penalty on pixels needs them; 14 pixels leave some unused.
