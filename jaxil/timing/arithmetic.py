@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from jaxil import experiment
 from jaxil.config import Config
 from jaxil.timing import device, flops
 from jaxil.timing.bench import Bench
@@ -22,9 +23,12 @@ def count(bench: Bench, update_ms: float) -> dict[str, Any]:
       Operations in GFLOP, memory in MB; None where XLA or `flops` can't tell.
     """
     program = bench.lower_update().compile()
-    by_xla = (program.cost_analysis() or {}).get("flops")
+    config = bench.run.config
+    # XLA counts the body of a loop once, however often it runs.
+    loops = 0 < experiment.chunk_size(config) <= config.batch_size // 2
+    by_xla = None if loops else (program.cost_analysis() or {}).get("flops")
     by_hand = by_part(
-        bench.run.config, bench.episode.frames.shape[1:], bench.episode.actions.shape[1]
+        config, bench.episode.frames.shape[1:], bench.episode.actions.shape[1]
     )
     total = None if by_hand is None else sum(by_hand.values())
     chosen = by_xla if total is None else total

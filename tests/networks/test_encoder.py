@@ -187,7 +187,8 @@ class EncodeTest(chex.TestCase):
 
             return jax.grad(weighted, has_aux=True)(params)
 
-        gradients, value = self.variant(both)(params)
+        run: Any = self.variant(both)
+        gradients, value = run(params)
         expected, transpose = jax.vjp(lambda p: plain.apply(p, images), params)
         np.testing.assert_allclose(value, expected, rtol=1e-5, atol=1e-5)
         chex.assert_trees_all_close(
