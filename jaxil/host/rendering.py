@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from jaxil.host import drawing
 from jaxil.host import environment as environments
+from jaxil.host.drawer import Episode
 
 # Part of each key: raise it when drawing changes in a way that the key can't see.
 _CACHE_VERSION = 2
@@ -42,6 +44,7 @@ def observe_episodes(
     observation: str = "pixels",
     cache: bool = True,
     progress: Callable[[int, int], None] | None = None,
+    processes: int | None = None,
 ) -> np.ndarray:
     """Shows stored episodes as the agent's own environment would.
 
@@ -56,6 +59,7 @@ def observe_episodes(
       observation: "pixels" or "state".
       cache: whether images are looked up in, and added to, `cache_folder()`.
       progress: called with (images drawn, images in all), if any have to be.
+      processes: how many draw, see `drawing.draw`; the images are the same.
 
     Returns:
       Images, uint8 [K, N + 1, H, W, 3], or states, float32 [K, N + 1, S].
@@ -64,14 +68,15 @@ def observe_episodes(
       ValueError: the states don't fit the task's model, or see `make_environment`.
       RuntimeError: nothing here can render.
     """
-    environment = environments.make_environment(
-        task,
-        seed=seed,
-        image_size=image_size,
-        frame_stack=1,
-        render_quality=render_quality,
-        observation=observation,
-    )
+    settings = {
+        "task": task,
+        "seed": seed,
+        "image_size": image_size,
+        "frame_stack": 1,
+        "render_quality": render_quality,
+        "observation": observation,
+    }
+    environment = environments.make_environment(**settings)
     try:
         spec = environment.observation_spec()
         num_episodes, length = states["qpos"].shape[:2]
@@ -86,27 +91,45 @@ def observe_episodes(
             "versions": environments.simulator_versions(),
             "gl": environment.renderer.gl_name() if caches else "",
         }
-        num_drawn = 0
-        for index in range(num_episodes):
-            number = first_episode + index
-            episode = {name: array[index] for name, array in states.items()}
-            path = _cache_path({**about, "episode": number}, episode)
-            found = _read_cached(path, observed[index]) if caches else None
-            if found is not None:
-                observed[index] = found
-                num_drawn += length
-                continue
-            environment.reset(episode=number)
-            for time in range(length):
-                environment.set_simulator_state(
-                    **{name: array[time] for name, array in episode.items()}
-                )
-                observed[index, time] = environment.single_observation()
+        episodes = [
+            Episode(
+                place,
+                first_episode + place,
+                {name: array[place] for name, array in states.items()},
+            )
+            for place in range(num_episodes)
+        ]
+        paths = [
+            _cache_path({**about, "episode": episode.number}, episode.states)
+            for episode in episodes
+        ]
+        missing = []
+        for episode, path in zip(episodes, paths):
+            found = _read_cached(path, observed[episode.place]) if caches else None
+            if found is None:
+                missing.append(episode)
+            else:
+                observed[episode.place] = found
+        num_drawn = (num_episodes - len(missing)) * length
+
+        def take(place: int, start: int, images: np.ndarray) -> None:
+            nonlocal num_drawn
+            end = start + len(images)
+            observed[place, start:end] = images
+            for _ in images:
                 num_drawn += 1
                 if progress is not None:
                     progress(num_drawn, num_episodes * length)
-            if caches:
-                _write_cached(path, observed[index])
+            if caches and end == length:
+                _write_cached(paths[place], observed[place])
+
+        drawing.draw(
+            environment,
+            missing,
+            settings=settings,
+            take=take,
+            processes=processes if observation == "pixels" else 1,
+        )
     finally:
         environment.close()
     return observed
