@@ -10,18 +10,31 @@ place of convolutions, and runs at some 500 frames per second on one CPU core.
 
 from jaxil import config as jaxil_config
 
-# Frames until an expert is good enough to be imitated; the others take longer.
+# Frames until an expert is good enough to be imitated: those of the shipped ones.
 _FRAMES = {
     "ball_in_cup_catch": 80_000,
     "cartpole_swingup": 100_000,
-    "walker_stand": 200_000,
-    "walker_walk": 300_000,
-    "finger_spin": 500_000,
+    "walker_walk": 500_000,
+    "walker_stand": 900_000,
+    "finger_spin": 900_000,
+    "cheetah_run": 3_000_000,
 }
 _MANY_FRAMES = 1_000_000
+# Agent steps until exploration has faded. A finger that spins slowly is paid for it,
+# and has to go on trying for longer.
+_EXPLORATION_STEPS = {
+    "ball_in_cup_catch": 50_000,
+    "cartpole_swingup": 50_000,
+    "walker_stand": 50_000,
+    "finger_spin": 150_000,
+}
+_LONG_EXPLORATION_STEPS = 100_000
 # Three rewards in one step speed most tasks up; a finger that has to hit in time is
 # held back by those that older, noisier policies earned.
 _NUM_STEPS = {"finger_spin": 1}
+# Without it the actor saturates; see `losses.saturation_penalty`.
+_PENALTIES = {"finger_spin": 1e-2}
+_PENALTY = 3e-3
 
 
 def get_config(task: str = "cartpole_swingup"):
@@ -33,10 +46,8 @@ def get_config(task: str = "cartpole_swingup"):
     config.learning_rate = 3e-4
     config.hidden_dim = 256
     config.num_steps = _NUM_STEPS.get(task, 3)  # on walkers too
-    hard = config.total_frames >= _MANY_FRAMES
-    config.exploration_std_steps = 100_000 if hard else 50_000
-    # Without it the actor saturates; see `losses.saturation_penalty`.
-    config.pre_tanh_penalty = 3e-3
+    config.exploration_std_steps = _EXPLORATION_STEPS.get(task, _LONG_EXPLORATION_STEPS)
+    config.pre_tanh_penalty = _PENALTIES.get(task, _PENALTY)
     config.eval_every_frames = 20_000
     config.checkpoint_every_frames = 20_000
     config.video_every_evals = 0

@@ -1,0 +1,166 @@
+"""A search for actions with the simulator, led by a learned policy and its values."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+from studio import ACTION_REPEAT
+
+_FULL_SPEED = 10.0  # m/s, from which the task pays 1 a frame
+_STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
+
+# Observations [B, S] -> actions [B, A] and the values [B] of taking them.
+Judge = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+class Effort(NamedTuple):
+    """How long a decision is thought about.
+
+    Attributes:
+      horizon: H, decisions that are simulated.
+      candidates: N, sequences of H actions in each round.
+      rounds: of drawing around the best sequences of the round before.
+      spread: standard deviation of the first round's draws.
+      elites: sequences that the next round is drawn around.
+      temperature: of their weights, in units of return.
+    """
+
+    horizon: int = 10
+    candidates: int = 64
+    rounds: int = 12
+    spread: float = 0.4
+    elites: int = 8
+    temperature: float = 0.1
+
+
+class Simulator:
+    """MuJoCo itself, run from any state without touching the environment."""
+
+    def __init__(self, physics: Any) -> None:
+        """Prepares to simulate the model of a dm_control `Physics`."""
+        self._model, self._live = physics.model.ptr, physics.data.ptr
+        self._data = mujoco.MjData(self._model)
+        sensor = self._model.sensor("torso_subtreelinvel")
+        self._speed = int(sensor.adr[0])
+        self._positions = slice(2, 1 + self._model.nq)  # all but time and the x axis
+        start = 1 + self._model.nq
+        self._velocities = slice(start, start + self._model.nv)
+
+    def now(self) -> np.ndarray:
+        """Returns the environment's present state, shape [P]."""
+        state = np.empty(mujoco.mj_stateSize(self._model, _STATE))
+        mujoco.mj_getState(self._model, self._live, state, _STATE)
+        return state
+
+    def run(
+        self, state: np.ndarray, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Tries sequences of actions.
+
+        Args:
+          state: where all of them start, shape [P].
+          actions: shape [N, H, A], in [-1, 1].
+
+        Returns:
+          States after each decision [N, H, P], and rewards [N, H]: a step's speed is
+          that of the state it starts from, one frame before the task's own.
+        """
+        count, horizon, _ = actions.shape
+        controls = np.repeat(actions, ACTION_REPEAT, axis=1).astype(np.float64)
+        starts = np.tile(state, (count, 1))
+        states, sensors = rollout.rollout(self._model, self._data, starts, controls)
+        paid = np.clip(sensors[:, :, self._speed] / _FULL_SPEED, 0.0, 1.0)
+        rewards = paid.reshape(count, horizon, ACTION_REPEAT).sum(axis=2)
+        return states[:, ACTION_REPEAT - 1 :: ACTION_REPEAT], rewards
+
+    def observe(self, states: np.ndarray) -> np.ndarray:
+        """Returns what the suite observes of states, [..., P] to float32 [..., S]."""
+        parts = states[..., self._positions], states[..., self._velocities]
+        return np.concatenate(parts, axis=-1).astype(np.float32)
+
+
+def follow(
+    simulator: Simulator, judge: Judge, state: np.ndarray, horizon: int
+) -> np.ndarray:
+    """Returns what the policy would do from a state on, shape [H, A]."""
+    actions = []
+    for _ in range(horizon):
+        action = judge(simulator.observe(state)[None])[0]
+        state = simulator.run(state, action[None])[0][0, -1]
+        actions.append(action[0])
+    return np.stack(actions)
+
+
+def score(
+    simulator: Simulator,
+    judge: Judge,
+    state: np.ndarray,
+    actions: np.ndarray,
+    discount: float,
+) -> np.ndarray:
+    """Returns the discounted rewards of sequences, and the value of where they end.
+
+        sum_{t<H} gamma^t r_t + gamma^H min_k Q_k(s_H, pi(s_H))
+
+    Args:
+      simulator: what they are tried in.
+      judge: policy and values.
+      state: where they start.
+      actions: shape [N, H, A].
+      discount: gamma.
+
+    Returns:
+      Shape [N].
+    """
+    states, rewards = simulator.run(state, actions)
+    horizon = actions.shape[1]
+    values = judge(simulator.observe(states[:, -1]))[1]
+    return rewards @ discount ** np.arange(horizon) + discount**horizon * values
+
+
+def search(
+    simulator: Simulator,
+    judge: Judge,
+    state: np.ndarray,
+    plan: np.ndarray | None,
+    effort: Effort,
+    discount: float,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Returns a sequence of actions that is better than the policy's.
+
+    The cross-entropy method, weighted as in MPPI: each round draws around the weighted
+    mean of the round before; the policy's own sequence is always a candidate.
+
+    Args:
+      simulator: what they are tried in.
+      judge: policy and values.
+      state: where they start.
+      plan: the last decision's result; None at an episode's start.
+      effort: how much is tried.
+      discount: gamma.
+      rng: of the draws.
+
+    Returns:
+      Shape [H, A], of which the first is to be done.
+    """
+    usual = follow(simulator, judge, state, effort.horizon)
+    mean = usual if plan is None else np.concatenate([plan[1:], usual[-1:]])
+    spread = np.full(mean.shape, effort.spread)
+    for _ in range(effort.rounds):
+        drawn = rng.standard_normal((effort.candidates, *mean.shape))
+        candidates = mean + spread * drawn
+        few = effort.candidates // 4
+        candidates[:few] = usual + effort.spread * drawn[:few]
+        candidates[0], candidates[1] = usual, mean
+        candidates = np.clip(candidates, -1.0, 1.0)
+        scores = score(simulator, judge, state, candidates, discount)
+        best = np.argsort(-scores)[: effort.elites]
+        weights = np.exp((scores[best] - scores[best[0]]) / effort.temperature)
+        weights = (weights / weights.sum())[:, None, None]
+        mean = np.sum(weights * candidates[best], axis=0)
+        variance = np.sum(weights * np.square(candidates[best] - mean), axis=0)
+        spread = np.clip(np.sqrt(variance), 0.05, effort.spread)
+    return mean
