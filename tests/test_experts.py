@@ -1,4 +1,4 @@
-"""The controllers of launch/experts: their model, their search, what they record."""
+"""The controllers of launch/experts: their models, their search, what they record."""
 
 import importlib
 import subprocess
@@ -134,9 +134,24 @@ def test_acrobot_record_is_what_its_actions_do(environment, tmp_path, monkeypatc
     ],
 )
 def test_wrong_use_of_an_expert_is_one_sentence(flags, named, tmp_path):
+    _assert_one_sentence("acrobot.py", flags, named, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (("--output=FOLDER/a.npz",), "--workdir"),
+        (("--output=FOLDER/a.npz", "--workdir=FOLDER/none"), "none"),
+    ],
+)
+def test_wrong_use_of_the_cheetah_is_one_sentence(flags, named, tmp_path):
+    _assert_one_sentence("cheetah.py", flags, named, tmp_path)
+
+
+def _assert_one_sentence(script, flags, named, tmp_path):
     words = [flag.replace("FOLDER", str(tmp_path)) for flag in flags]
     ended = subprocess.run(
-        [sys.executable, str(_FOLDER / "acrobot.py"), *words],
+        [sys.executable, str(_FOLDER / script), *words],
         check=False,
         capture_output=True,
         text=True,
@@ -144,5 +159,68 @@ def test_wrong_use_of_an_expert_is_one_sentence(flags, named, tmp_path):
     )
     assert ended.returncode == 2
     assert named in ended.stderr
-    assert len(ended.stderr.strip().splitlines()) == 1
+    said = [line for line in ended.stderr.splitlines() if not line.startswith("jax on")]
+    assert len(said) == 1
     assert not list(tmp_path.iterdir())
+
+
+# Cheetah -----------------------------------------------------------------------
+
+
+@pytest.fixture
+def cheetah():
+    module = importlib.import_module("cheetah_search")
+    made = make_environment("cheetah_run", seed=777, observation="state")
+    made.reset(episode=1)
+    start = made.simulator_state()
+    start["qvel"][0] = 3.0  # m/s: what does not run earns nothing
+    made.set_simulator_state(**start)
+    yield made, module.Simulator(made.physics), module
+    made.close()
+
+
+def test_cheetah_simulator_goes_where_the_environment_goes(cheetah):
+    environment, simulator, _ = cheetah
+    rng = np.random.default_rng(0)
+    actions = np.sign(rng.uniform(-1, 1, (2, 25, 6)))
+    states, rewards = simulator.run(simulator.now(), actions)
+    told = []
+    for state, action in zip(states[1], actions[1], strict=True):
+        timestep = environment.step(action)
+        np.testing.assert_allclose(simulator.now(), state, atol=1e-9)
+        np.testing.assert_allclose(
+            simulator.observe(state), timestep.observation, atol=1e-6
+        )
+        told.append(timestep.reward)
+    # Each of its rewards is that of the frame before.
+    assert sum(told) > 1.0
+    assert rewards[1].sum() == pytest.approx(sum(told), abs=0.2)
+    assert not np.allclose(states[0, -1], states[1, -1])
+
+
+def test_cheetah_search_beats_the_policy_it_starts_from(cheetah):
+    _, simulator, module = cheetah
+
+    def judge(observations):  # stands still, and expects nothing
+        return np.zeros((len(observations), 6)), np.zeros(len(observations))
+
+    effort = module.Effort(horizon=8, candidates=32, rounds=3)
+    state, rng = simulator.now(), np.random.default_rng(0)
+    usual = module.follow(simulator, judge, state, effort.horizon)
+    np.testing.assert_array_equal(usual, np.zeros((8, 6)))
+    plan = module.search(simulator, judge, state, None, effort, 0.99, rng)
+    both = np.stack([usual, plan])
+    idle, found = module.score(simulator, judge, state, both, 0.99)
+    assert found > idle + 0.1
+    assert np.abs(plan).max() <= 1.0
+
+
+def test_cheetah_score_by_hand(cheetah):
+    _, simulator, module = cheetah
+    values = iter([np.array([3.0])])
+    state, actions = simulator.now(), np.zeros((1, 2, 6))
+    rewards = simulator.run(state, actions)[1][0]
+    total = module.score(
+        simulator, lambda o: (np.zeros((1, 6)), next(values)), state, actions, 0.5
+    )
+    assert total[0] == pytest.approx(rewards[0] + 0.5 * rewards[1] + 0.25 * 3.0)
