@@ -75,6 +75,8 @@ def _label(config: dict) -> str:
         f"replay {config['replay_size_steps'] // 1000}k",
         f"seed {config['seed']}",
     ]
+    if config["observation"] == "state":
+        parts.append("state vector")
     if config["render_quality"] == "smooth":
         parts.append("smooth")
     penalty = config["discriminator"]["gradient_penalty"]
