@@ -73,7 +73,7 @@ def main() -> None:
         axes.set_xlabel(panel.across)
         axes.set_ylabel(panel.up)
         axes.set_xticks(x)
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, 1.1 * max([*y, *(each for each in high if each is not None)]))
         axes.grid(axis="y", alpha=0.25, lw=0.6)
         axes.spines[["top", "right"]].set_visible(False)
         axes.set_title(_setting(results[0]), loc="left", fontsize=8)
