@@ -43,10 +43,24 @@ def convolve(
 
     Returns:
       Shape [B, (H - h) // stride + 1, (W - w) // stride + 1, F].
+
+    Raises:
+      ValueError: another convolution is asked for.
     """
-    del padding, lhs_dilation, rhs_dilation, dimension_numbers
-    del feature_group_count, precision
     chex.assert_rank([images, kernel], 4)
+    layout = lax.conv_dimension_numbers(images.shape, kernel.shape, _LAYOUT)
+    plain = (
+        padding == "VALID"
+        and set(lhs_dilation or [1]) == set(rhs_dilation or [1]) == {1}
+        and dimension_numbers in (None, _LAYOUT, layout)
+        and feature_group_count == 1
+        and precision is None
+    )
+    if not plain:
+        raise ValueError(
+            "only VALID convolutions of channels-last images are computed here, "
+            "without dilation, groups or precision; take jax.lax.conv_general_dilated"
+        )
     return _convolve(tuple(strides), images, kernel)
 
 
@@ -93,6 +107,15 @@ def image_gradient(
       Shape [B, H, W, C].
     """
     chex.assert_rank([cotangent, kernel], 4)
+    if tuple(kernel.shape[:2]) == tuple(strides):
+        # No two windows overlap, so nothing is summed but the features.
+        apart = jnp.einsum("bijf,uvcf->biujvc", cotangent, kernel)
+        batch, rows, height, columns, width, channels = apart.shape
+        seen = apart.reshape(batch, rows * height, columns * width, channels)
+        unseen = [
+            (0, full - used) for full, used in zip(size, seen.shape[1:3], strict=True)
+        ]
+        return jnp.pad(seen, [(0, 0), *unseen, (0, 0)])
     padding = [
         (window - 1, full - ((reduced - 1) * stride + 1))
         for window, full, reduced, stride in zip(

@@ -134,3 +134,21 @@ def test_rejects_an_image_without_batch():
     image, kernel = draw(0, (9, 9, 2), (3, 3, 2, 4))
     with pytest.raises(AssertionError):
         convolution.convolve(image, kernel, (2, 2), "VALID")
+
+
+@pytest.mark.parametrize(
+    ("padding", "asked"),
+    [
+        ("SAME", {}),
+        ([(1, 1), (1, 1)], {}),
+        ("VALID", {"rhs_dilation": (2, 2)}),
+        ("VALID", {"lhs_dilation": (1, 2)}),
+        ("VALID", {"feature_group_count": 2}),
+        ("VALID", {"precision": "highest"}),
+        ("VALID", {"dimension_numbers": ("NCHW", "HWIO", "NHWC")}),
+    ],
+)
+def test_rejects_what_it_does_not_compute(padding, asked):
+    images, kernel = draw(0, (2, 9, 9, 2), (3, 3, 2, 4))
+    with pytest.raises(ValueError, match="only VALID"):
+        convolution.convolve(images, kernel, (2, 2), padding, **asked)
