@@ -25,6 +25,17 @@ def test_a_field_that_is_newer_than_the_run_has_its_default(tmp_path):
     assert "sinkhorn.alignment: 'transport' there, 'time' here" in fault
 
 
+def test_a_run_goes_on_longer_or_in_other_chunks(tmp_path):
+    # The presets' chunks differ: a run that is older than the field has the default's.
+    config = jaxil_config.default_config("psil", "walker_walk")
+    old = config.to_dict()
+    del old["encoder"]["chunk_size"]
+    write(tmp_path, old)
+    config.encoder.chunk_size = 64
+    config.total_frames *= 2
+    assert workdir.problems(tmp_path, config) == []
+
+
 def test_what_was_written_is_read(tmp_path):
     config = jaxil_config.default_config("pdac", "cheetah_run")
     config.encoder.channels = (8, 4)

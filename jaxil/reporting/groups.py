@@ -10,9 +10,15 @@ import numpy as np
 from jaxil import figures
 from jaxil.reporting.runs import Run, paper_settings
 
-# Runs that differ in nothing else are seeds of one thing. The last two decide what is
-# kept on disk, not what is learned.
-_FREE_FIELDS = ("seed", "total_frames", "checkpoint_every_frames", "video_every_evals")
+# Runs that differ in nothing else are seeds of one thing. From the third on they decide
+# what is kept on disk, or how fast it comes, not what is learned.
+_FREE_FIELDS = (
+    "seed",
+    "total_frames",
+    "checkpoint_every_frames",
+    "video_every_evals",
+    "encoder.chunk_size",
+)
 # The name of the variant, or of the panel, says these already.
 _NAMED_FIELDS = (
     "method",
