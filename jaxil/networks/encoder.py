@@ -111,17 +111,26 @@ def encode(
         return representation
 
     observation = jnp.asarray(observation)
-    chunk = getattr(encoder, "chunk_size", 0)
-    num_chunks = observation.shape[0] // chunk if chunk else 0
-    if num_chunks < 2:
+    size = observation.shape[0]
+    loops = num_chunks(encoder, size)
+    if not loops:
         return whole(params, observation)
-    chunks, rest = jnp.split(observation, [num_chunks * chunk])
+    chunk = encoder.chunk_size
+    chunks, rest = jnp.split(observation, [loops * chunk])
     again = jax.checkpoint(whole)
     encoded = lax.map(
         lambda images: again(params, images),
-        chunks.reshape(num_chunks, chunk, *observation.shape[1:]),
+        chunks.reshape(loops, chunk, *observation.shape[1:]),
     )
-    encoded = encoded.reshape(num_chunks * chunk, -1)
+    encoded = encoded.reshape(loops * chunk, -1)
     if rest.shape[0]:
         encoded = jnp.concatenate([encoded, whole(params, rest)])
     return encoded
+
+
+def num_chunks(encoder: PixelEncoder | StateEncoder, size: int) -> int:
+    """Returns how often `encode` loops for a batch of `size`; 0 if it does not."""
+    if not isinstance(encoder, PixelEncoder) or not encoder.chunk_size:
+        return 0
+    chunks = size // encoder.chunk_size
+    return chunks if chunks > 1 else 0

@@ -4,6 +4,7 @@ from typing import Any
 
 from jaxil import experiment
 from jaxil.config import Config
+from jaxil.networks.encoder import num_chunks
 from jaxil.timing import device, flops
 from jaxil.timing.bench import Bench
 
@@ -25,7 +26,9 @@ def count(bench: Bench, update_ms: float) -> dict[str, Any]:
     program = bench.lower_update().compile()
     config = bench.run.config
     # XLA counts the body of a loop once, however often it runs.
-    loops = 0 < experiment.chunk_size(config) <= config.batch_size // 2
+    encoder = experiment.make_networks(config, bench.episode.actions.shape[1], 0.5)[0]
+    sizes = [len(batch.action) for batch in bench.batches if batch is not None]
+    loops = max(num_chunks(encoder, size) for size in sizes)
     by_xla = None if loops else (program.cost_analysis() or {}).get("flops")
     by_hand = by_part(
         config, bench.episode.frames.shape[1:], bench.episode.actions.shape[1]

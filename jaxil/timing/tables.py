@@ -86,7 +86,8 @@ def results_table(results: Mapping[str, Any]) -> str:
         "",
         "Parts of the update are compiled and timed alone: they need not sum up to it.",
     ]
-    if results["update_gflop_by_hand"] is None:
+    by_hand = results["update_gflop_by_hand"] is not None
+    if not by_hand and results["utilisation_percent"] is not None:
         lines.append("Utilisation is by XLA's count: none by hand for this method.")
     return "\n".join(lines)
 
