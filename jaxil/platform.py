@@ -1,6 +1,6 @@
-"""The machine, before first use: which GL draws, which flags XLA is given.
+"""The machine, before first use: which GL draws, which flags XLA and malloc are given.
 
-Both are read once, when mujoco and jax are first imported, so every command calls
+They are read once, when mujoco and jax are first imported, so every command calls
 `prepare` before it imports either. What the user has set stays as it is.
 """
 
@@ -41,7 +41,7 @@ _MALLOC_SETTINGS = (
     (-4, 0),  # M_MMAP_MAX
     (-1, 2**31 - 1),  # M_TRIM_THRESHOLD
 )
-_MALLOC_VARIABLES = ("GLIBC_TUNABLES", "MALLOC_ARENA_MAX", "MALLOC_MMAP_MAX_")
+_MALLOC_VARIABLES = ("GLIBC_TUNABLES", "MALLOC_")  # as they begin
 _GL_PROBE_SECONDS = 15.0
 _GL_PROBE_TRIES = 2  # drivers have been seen to hang, once in hundreds of tries
 
@@ -198,7 +198,7 @@ def _keep_freed_memory() -> None:
     system hands them out in 38000 pages of zeros, 5 % of the update's time. Without
     effect where the C library is not glibc.
     """
-    if any(name in os.environ for name in _MALLOC_VARIABLES):
+    if any(name.startswith(_MALLOC_VARIABLES) for name in os.environ):
         return
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:

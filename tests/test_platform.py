@@ -272,6 +272,7 @@ def test_freed_memory_is_used_again():
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="mallopt is glibc's")
-def test_the_users_own_allocator_settings_stay():
+@pytest.mark.parametrize("name", ["MALLOC_ARENA_MAX", "MALLOC_TOP_PAD_"])
+def test_the_users_own_allocator_settings_stay(name):
     # 4 blocks of 16384 pages each, asked for anew (fewer if pages are huge).
-    assert _new_pages(MALLOC_ARENA_MAX="8") > 2 * _new_pages()
+    assert _new_pages(**{name: "8"}) > 2 * _new_pages()
