@@ -46,11 +46,7 @@ def record(run: Trained, *, num_episodes: int, seed: int) -> states.StateDemonst
             action_repeat=config.action_repeat,
             seed=seed,
             first_episode=0,
-            expert=(
-                f"{config.method} learner on {config.observation}, seed {config.seed}, "
-                f"{run.frame} frames, {run.seconds / 60:.0f} minutes of training; mean "
-                "action, no noise"
-            ),
+            expert=f"{run.description()}; mean action, no noise",
             rewards=rewards,
         ),
     )

@@ -12,6 +12,7 @@ from jaxil.config import Config
 from jaxil.host import demonstrations as host_demonstrations
 from jaxil.host.checkpoint import CheckpointError, Checkpoints
 from jaxil.host.environment import PixelEnvironment
+from jaxil.learner.state import LearnerParams
 
 
 class Trained(NamedTuple):
@@ -21,6 +22,7 @@ class Trained(NamedTuple):
       config: the run's settings.
       environment: one of its own, apart from the training's.
       act: observation -> mean action.
+      params: of encoder, actor and critic.
       demonstrations: what the run imitates; None without.
       frame: environment frames that the policy was trained for.
       episode: training episodes so far.
@@ -30,10 +32,19 @@ class Trained(NamedTuple):
     config: Config
     environment: PixelEnvironment
     act: Callable[[np.ndarray], np.ndarray]
+    params: LearnerParams
     demonstrations: host_demonstrations.Demonstrations | None
     frame: int
     episode: int
     seconds: float
+
+    def description(self) -> str:
+        """Says in a few words how the policy came to be."""
+        config = self.config
+        return (
+            f"{config.method} learner on {config.observation}, seed {config.seed}, "
+            f"{self.frame} frames, {self.seconds / 60:.0f} minutes of training"
+        )
 
 
 def load(folder: pathlib.Path) -> Trained:
@@ -65,6 +76,7 @@ def load(folder: pathlib.Path) -> Trained:
         config=config,
         environment=environment,
         act=act,
+        params=state.params,
         demonstrations=demonstrations,
         frame=counters["num_steps"] * config.action_repeat,
         episode=counters["num_episodes"],

@@ -3,8 +3,7 @@
 from typing import Any
 
 import numpy as np
-
-ACTION_REPEAT = 2
+from studio import ACTION_REPEAT
 
 
 class Arm:

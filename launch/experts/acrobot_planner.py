@@ -3,7 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from acrobot_model import ACTION_REPEAT, Arm, task_reward
+from acrobot_model import Arm, task_reward
+from studio import ACTION_REPEAT
 
 _ELITE = 10  # gains that are varied in each round
 _VARIATION = 0.2  # relative, standard deviation

@@ -83,9 +83,8 @@ def load_judge(folder: pathlib.Path) -> tuple[Judge, Any, str]:
     import jax
     import jax.numpy as jnp
 
-    from jaxil import experiment, workdir
+    from jaxil import experiment, trained, workdir
     from jaxil.command import UsageError
-    from jaxil.host.checkpoint import CheckpointError, Checkpoints
     from jaxil.networks.agent import apply
 
     config = workdir.read_config(folder)
@@ -95,17 +94,11 @@ def load_judge(folder: pathlib.Path) -> tuple[Judge, Any, str]:
                 f"--workdir={folder} is a run with {field}={config[field]!r}, where "
                 f"{wanted!r} is needed; name one of configs/expert.py:{TASK}"
             )
-    environment = experiment.evaluation_environment(config)
-    agent = experiment.make_agent(config, environment, None)
-    try:
-        state, counters = Checkpoints(folder).restore(experiment.abstract_state(agent))
-    except CheckpointError as error:
-        raise UsageError(f"--workdir={folder}: {error}") from error
-    encoder, actor, critic = state.params
-    networks = experiment.make_networks(
-        config, environment.action_spec().shape[0], mean=0.5
-    )
-    environment.close()
+    run = trained.load(folder)
+    encoder, actor, critic = run.params
+    action_dim = run.environment.action_spec().shape[0]
+    networks = experiment.make_networks(config, action_dim, mean=0.5)
+    run.environment.close()
 
     @jax.jit
     def judge(observations: Any) -> tuple[jax.Array, jax.Array]:
@@ -114,15 +107,10 @@ def load_judge(folder: pathlib.Path) -> tuple[Judge, Any, str]:
         values = apply(networks.critic, critic, representation, actions)
         return actions, jnp.min(values, axis=0)
 
-    about = (
-        f"drqv2 learner on state, seed {config.seed}, "
-        f"{counters['num_steps'] * config.action_repeat} frames, "
-        f"{counters['seconds'] / 60:.0f} minutes of training"
-    )
     return (
         lambda observations: jax.tree.map(np.asarray, judge(observations)),
         config,
-        about,
+        run.description(),
     )
 
 

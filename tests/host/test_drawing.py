@@ -18,8 +18,8 @@ import pytest
 from jaxil.host import drawer, drawing, rendering
 from jaxil.host.environment import make_environment
 from jaxil.host.pixel_environment import PixelEnvironment
+from tests.commands import ROOT
 
-ROOT = pathlib.Path(__file__).parent.parent.parent
 TASK = "finger_turn_hard"  # its target is not part of the simulator's state
 SEED, FIRST, EPISODES, LENGTH, SIZE = 5, 3, 3, 40, 24
 TOTAL = EPISODES * LENGTH
