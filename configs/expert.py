@@ -17,6 +17,7 @@ _FRAMES = {
     "walker_walk": 500_000,
     "walker_stand": 900_000,
     "finger_spin": 900_000,
+    "walker_run": 1_400_000,
     "cheetah_run": 1_500_000,
 }
 _MANY_FRAMES = 1_000_000

@@ -12,8 +12,8 @@ replay is smaller, so that stored rewards follow the faster discriminator.
 
 On cartpole_swingup an action is repeated 4 times: at 48 pixels a pole that turns by
 1 rad/s moves a quarter of a pixel between frames 0.02 s apart, so at 2 repeats nothing
-shows its speed, and agents learn to spin it and no more; at 8 it can't be held. P-DAC's
-gradient penalty has weight 1 there.
+shows its speed, and agents learn to spin it and no more; at 8 none learned to hold it.
+P-DAC's gradient penalty has weight 1 there.
 """
 
 from jaxil import config as jaxil_config
