@@ -39,7 +39,7 @@ os._exit(0)
 _MALLOC_SETTINGS = (
     (-8, 1),  # M_ARENA_MAX
     (-4, 0),  # M_MMAP_MAX
-    (-1, 2**31 - 1),  # M_TRIM_THRESHOLD
+    (-1, -1),  # M_TRIM_THRESHOLD: the greatest there is
 )
 _MALLOC_VARIABLES = ("GLIBC_TUNABLES", "MALLOC_")  # as they begin
 _GL_PROBE_SECONDS = 15.0

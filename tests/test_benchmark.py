@@ -137,8 +137,6 @@ def test_a_sweep_measures_each_value(tmp_path):
         {"field": "batch_size", "value": 4},
         {"field": "batch_size", "value": 8},
     ]
-    # Nothing loops over chunks of states, so XLA's count is told.
-    assert all(each["update_gflop"] > each["update_gflop_by_hand"] for each in found)
     # Places of frames only, of half as many samples.
     assert found[0]["batch_mb"] * 2 == pytest.approx(found[1]["batch_mb"])
     assert found[0]["update_gflop_by_hand"] * 2 == found[1]["update_gflop_by_hand"]

@@ -7,7 +7,7 @@ import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 
 from jaxil.maths import convolution
 from jaxil.maths.types import Data, Params
@@ -27,7 +27,7 @@ class PixelEncoder(nn.Module):
       mean: what is subtracted, in [0, 1]: 0.5 in the paper, or an image
         [H, W, C] as nested tuples or an array.
       dtype: of the convolutions; parameters are float32 whatever it is.
-      chunk_size: for CPUs, see `encode`; 0 leaves all to XLA.
+      chunk_size: images that `encode` takes at a time; 0 for all.
 
     Source: facebookresearch/drqv2, drqv2.py, `Encoder`.
     """
@@ -48,7 +48,6 @@ class PixelEncoder(nn.Module):
         mean = jnp.asarray(self.mean, jnp.float32)
         x = self.contrast * (x - (mean[None] if mean.ndim else mean))
         layers = zip(self.channels, self.kernel_sizes, self.strides, strict=True)
-        convolve = convolution.convolve if self.chunk_size else None
         for features, size, stride in layers:
             x = nn.Conv(
                 features,
@@ -57,7 +56,7 @@ class PixelEncoder(nn.Module):
                 padding="VALID",
                 kernel_init=nn.initializers.orthogonal(scale=math.sqrt(2.0)),
                 dtype=self.dtype,
-                conv_general_dilated=convolve,
+                conv_general_dilated=convolution.convolve,
             )(x)
             x = nn.relu(x)
         return x.reshape(x.shape[0], -1)
@@ -91,10 +90,9 @@ def encode(
 ) -> Array:
     """Returns the representation of a batch, computed a few images at a time.
 
-    What a CPU computes of `chunk_size` images stays in its caches, where the layers of
-    a whole batch are hundreds of megabytes that it writes, reads and asks the system
-    for. Gradients compute a chunk's layers a second time, which takes less time than
-    bringing them back. Value and gradients are the same up to the order of summation.
+    The layers of a whole batch are hundreds of megabytes, which a CPU writes to memory
+    and reads again at each step of theirs; those of a chunk stay in its caches. Value
+    and gradients are the same up to the order of summation.
 
     Args:
       encoder: with its `chunk_size`; 0 computes the whole batch at once.
@@ -105,32 +103,17 @@ def encode(
       Shape [B, R].
     """
 
-    def whole(params: Params, observation: Array) -> Array:
+    def whole(observation: Array) -> Array:
         representation = encoder.apply(params, observation)
         assert isinstance(representation, jax.Array)
         return representation
 
     observation = jnp.asarray(observation)
-    size = observation.shape[0]
-    loops = num_chunks(encoder, size)
-    if not loops:
-        return whole(params, observation)
-    chunk = encoder.chunk_size
-    chunks, rest = jnp.split(observation, [loops * chunk])
-    again = jax.checkpoint(whole)
-    encoded = lax.map(
-        lambda images: again(params, images),
-        chunks.reshape(loops, chunk, *observation.shape[1:]),
-    )
-    encoded = encoded.reshape(loops * chunk, -1)
-    if rest.shape[0]:
-        encoded = jnp.concatenate([encoded, whole(params, rest)])
-    return encoded
-
-
-def num_chunks(encoder: PixelEncoder | StateEncoder, size: int) -> int:
-    """Returns how often `encode` loops for a batch of `size`; 0 if it does not."""
-    if not isinstance(encoder, PixelEncoder) or not encoder.chunk_size:
-        return 0
-    chunks = size // encoder.chunk_size
-    return chunks if chunks > 1 else 0
+    batch = observation.shape[0]
+    chunk = encoder.chunk_size if isinstance(encoder, PixelEncoder) else 0
+    if not 0 < chunk < batch:
+        return whole(observation)
+    # Not a loop: XLA would copy what its gradient needs into and out of arrays of all
+    # chunks, and finds nothing to do for a second core between two of them.
+    chunks = jnp.split(observation, list(range(chunk, batch, chunk)))
+    return jnp.concatenate([whole(images) for images in chunks])

@@ -2,9 +2,7 @@
 
 from typing import Any
 
-from jaxil import experiment
 from jaxil.config import Config
-from jaxil.networks.encoder import num_chunks
 from jaxil.timing import device, flops
 from jaxil.timing.bench import Bench
 
@@ -24,14 +22,9 @@ def count(bench: Bench, update_ms: float) -> dict[str, Any]:
       Operations in GFLOP, memory in MB; None where XLA or `flops` can't tell.
     """
     program = bench.lower_update().compile()
-    config = bench.run.config
-    # XLA counts the body of a loop once, however often it runs.
-    encoder = experiment.make_networks(config, bench.episode.actions.shape[1], 0.5)[0]
-    sizes = [len(batch.action) for batch in bench.batches if batch is not None]
-    loops = max(num_chunks(encoder, size) for size in sizes)
-    by_xla = None if loops else (program.cost_analysis() or {}).get("flops")
+    by_xla = (program.cost_analysis() or {}).get("flops")
     by_hand = by_part(
-        config, bench.episode.frames.shape[1:], bench.episode.actions.shape[1]
+        bench.run.config, bench.episode.frames.shape[1:], bench.episode.actions.shape[1]
     )
     total = None if by_hand is None else sum(by_hand.values())
     chosen = by_xla if total is None else total

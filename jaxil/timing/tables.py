@@ -86,8 +86,7 @@ def results_table(results: Mapping[str, Any]) -> str:
         "",
         "Parts of the update are compiled and timed alone: they need not sum up to it.",
     ]
-    by_hand = results["update_gflop_by_hand"] is not None
-    if not by_hand and results["utilisation_percent"] is not None:
+    if results["update_gflop_by_hand"] is None:
         lines.append("Utilisation is by XLA's count: none by hand for this method.")
     return "\n".join(lines)
 

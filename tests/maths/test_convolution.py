@@ -69,20 +69,12 @@ class ConvolveTest(chex.TestCase):
         value = self.variant(lambda x, w: ours(x, w, strides))(images, kernel)
         np.testing.assert_allclose(value, reference(images, kernel, strides), atol=1e-4)
 
-    def test_kernel_gradient_by_hand(self):
-        # One window as large as the image, so each weight meets just one pixel.
-        images = jnp.arange(12.0).reshape(1, 2, 3, 2)
-        gradient = convolution.kernel_gradient(
-            images, jnp.full((1, 1, 1, 1), 2.0), (1, 1), (2, 3)
-        )
-        np.testing.assert_array_equal(gradient[..., 0], 2.0 * images[0])
-
-    def test_image_gradient_by_hand(self):
-        # Windows of 2 at a stride of 3 see every pixel but each third one.
+    def test_tile_gradient_by_hand(self):
+        # Windows of 2 see every pixel but a last, odd one.
         kernel = jnp.asarray([1.0, 10.0]).reshape(1, 2, 1, 1)
         cotangent = jnp.asarray([1.0, 2.0]).reshape(1, 1, 2, 1)
-        gradient = convolution.image_gradient(cotangent, kernel, (1, 3), (1, 6))
-        np.testing.assert_array_equal(gradient.reshape(-1), [1, 10, 0, 2, 20, 0])
+        gradient = convolution.tile_gradient(cotangent, kernel, (1, 5))
+        np.testing.assert_array_equal(gradient.reshape(-1), [1, 10, 2, 20, 0])
 
     def test_gradients_of_gradients_equal_xla(self):
         # As a gradient penalty on pixels needs them; 14 pixels leave some unused.
@@ -137,18 +129,29 @@ def test_rejects_an_image_without_batch():
 
 
 @pytest.mark.parametrize(
-    ("padding", "asked"),
+    ("padding", "settings"),
     [
         ("SAME", {}),
-        ([(1, 1), (1, 1)], {}),
+        ([(1, 0), (0, 1)], {}),
         ("VALID", {"rhs_dilation": (2, 2)}),
-        ("VALID", {"lhs_dilation": (1, 2)}),
+        ([(0, 0), (0, 0)], {"lhs_dilation": (1, 2)}),
         ("VALID", {"feature_group_count": 2}),
         ("VALID", {"precision": "highest"}),
-        ("VALID", {"dimension_numbers": ("NCHW", "HWIO", "NHWC")}),
+        ("VALID", {"dimension_numbers": ("NWHC", "HWIO", "NHWC")}),
     ],
 )
-def test_rejects_what_it_does_not_compute(padding, asked):
-    images, kernel = draw(0, (2, 9, 9, 2), (3, 3, 2, 4))
-    with pytest.raises(ValueError, match="only VALID"):
-        convolution.convolve(images, kernel, (2, 2), padding, **asked)
+def test_other_convolutions_are_xlas(padding, settings):
+    channels = 2 * settings.get("feature_group_count", 1)
+    images, kernel = draw(0, (2, 10, 9, channels), (2, 2, 2, 4))
+    settings = {"dimension_numbers": LAYOUT, **settings}
+
+    def both(convolve):
+        def convolved(images, kernel):
+            return convolve(images, kernel, (2, 2), padding, **settings)
+
+        value, transpose = jax.vjp(convolved, images, kernel)
+        return value, transpose(jnp.sin(17.0 * value))
+
+    chex.assert_trees_all_close(
+        both(convolution.convolve), both(lax.conv_general_dilated), atol=1e-5
+    )

@@ -11,7 +11,7 @@ from absl.testing import parameterized
 from jax import lax
 
 from jaxil.networks.agent import apply
-from jaxil.networks.encoder import PixelEncoder, StateEncoder, encode, num_chunks
+from jaxil.networks.encoder import PixelEncoder, StateEncoder, encode
 from jaxil.networks.layers import Trunk
 
 with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
@@ -169,6 +169,7 @@ class EncodeTest(chex.TestCase):
     @parameterized.parameters(
         (8, 2),  # four chunks
         (7, 2),  # three, and one image left over
+        (5, 4),  # one, and one image left over
         (4, 4),  # one: the batch is whole
         (3, 8),  # less than one
         (5, 0),  # XLA's own form
@@ -203,13 +204,6 @@ class EncodeTest(chex.TestCase):
         program = str(jax.make_jaxpr(lambda p: encode(encoder, p, images))(params))
         assert "f32[2,7,7,4]" in program
         assert "f32[8,7,7,4]" not in program
-        assert num_chunks(encoder, 8) == 4
-
-    def test_what_has_no_chunks_does_not_loop(self):
-        pixels, states = PixelEncoder(chunk_size=4), StateEncoder(4)
-        assert [num_chunks(pixels, size) for size in (1, 4, 7, 8, 9)] == [0, 0, 0, 2, 2]
-        assert num_chunks(PixelEncoder(chunk_size=0), 8) == 0
-        assert num_chunks(states, 8) == 0
 
     def test_states_are_encoded_as_they_come(self):
         states = jnp.arange(6.0).reshape(2, 3)

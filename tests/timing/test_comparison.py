@@ -24,19 +24,6 @@ def test_only_numbers_that_both_have_are_compared():
     assert ["update_ms", "10.00", "15.00", "1.50"] in rows
 
 
-def test_who_counted_is_said_where_there_is_a_count():
-    def last_line(utilisation, by_hand):
-        results: dict = {name: 1.0 for rows in tables.ROWS.values() for name in rows}
-        results |= {"device": "cpu: cpu", "num_devices": 1, "processor": "abacus"}
-        results |= {"usable_cores": 1, "cores": 1, "threads": 1, "repeats": 1}
-        results |= {"utilisation_percent": utilisation, "update_gflop_by_hand": by_hand}
-        return tables.results_table({**results, "ranges": {}}).splitlines()[-1]
-
-    assert "XLA's count" in last_line(3.0, None)
-    assert "XLA's count" not in last_line(None, None)
-    assert "XLA's count" not in last_line(3.0, 2.0)
-
-
 def test_a_ratio_to_nothing_is_left_out():
     text = tables.comparison_table({"render_ms": (0.0, 3.0)})
     assert text.splitlines()[1].split() == ["render_ms", "0.00", "3.00"]

@@ -83,7 +83,6 @@ def taken_apart():
     config.image_size = 40
     config.hidden_dim = config.discriminator.hidden_dim = 256
     config.batch_size, config.discriminator.batch_size = 64, 32
-    config.encoder.chunk_size = 0  # XLA counts the body of a loop once
     return config, *_parts_of(config)
 
 
