@@ -271,6 +271,30 @@ def test_freed_memory_is_used_again():
     assert _new_pages() < 1_000
 
 
+_HEAP_END = """
+import ctypes
+from jaxil import platform
+platform._keep_freed_memory()
+libc = ctypes.CDLL(None)
+libc.malloc.restype = libc.sbrk.restype = ctypes.c_void_p
+libc.malloc.argtypes, libc.free.argtypes = [ctypes.c_size_t], [ctypes.c_void_p]
+block = libc.malloc(3 * 2**30)  # never written to, so it takes no memory
+end = libc.sbrk(0)
+libc.free(block)
+print("no such address space" if block is None else end - libc.sbrk(0))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="mallopt is glibc's")
+def test_freed_memory_is_kept_beyond_what_an_int_counts():
+    given_back = subprocess.run(
+        [sys.executable, "-c", _HEAP_END], check=True, capture_output=True, text=True
+    ).stdout.strip()
+    if given_back == "no such address space":
+        pytest.skip(given_back)
+    assert given_back == "0"
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="mallopt is glibc's")
 @pytest.mark.parametrize("name", ["MALLOC_ARENA_MAX", "MALLOC_TOP_PAD_"])
 def test_the_users_own_allocator_settings_stay(name):
