@@ -95,12 +95,7 @@ class Run:
         self.stop_asked = False
         self.state: TrainState = self._restore_or_init()
         self.updates = Updates(
-            config,
-            self.agent,
-            self.replay,
-            demonstrations,
-            self.experts,
-            functools.partial(self._rng, _SAMPLED_BATCHES),
+            config, self.agent, self.replay, demonstrations, self.experts
         )
         self.exploration_key = jax.random.fold_in(
             jax.random.key(config.seed), _EXPLORATION_KEY
@@ -287,10 +282,9 @@ class Run:
 
     def update(self) -> None:
         """Draws a batch, and learns where enough of them are together."""
-        num_steps = self.counters.num_steps
-        if self.updates.collect(num_steps):
+        rng = self._rng(_SAMPLED_BATCHES, self.counters.num_steps)
+        if self.updates.collect(rng):
             self.flush()
-            self.updates.draw_ahead(num_steps + self.config.update_every_steps)
 
     def flush(self) -> None:
         """Makes the updates that are due and not made yet."""

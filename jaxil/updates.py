@@ -1,7 +1,5 @@
 """The learner's updates: their batches drawn, collected, brought to the device, run."""
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,7 +31,6 @@ class Updates:
         replay: Replay,
         demonstrations: host_demonstrations.Demonstrations | None,
         experts: ExpertEpisodes | None,
-        draws: Callable[[int], np.random.Generator],
     ) -> None:
         """Copies the frames to the device, where they shall lie there.
 
@@ -43,15 +40,12 @@ class Updates:
           replay: filled already, on a resume.
           demonstrations: what the method imitates, or None.
           experts: the same on the device, for methods that match whole episodes.
-          draws: decision -> what its batch is drawn by.
         """
         self._config = config
         self._agent = agent
         self._replay = replay
         self._demonstrations = demonstrations
-        self._draws = draws
         self._pending: list[Drawn] = []
-        self._ahead: tuple[int, Drawn] | None = None  # the decision, and its batch
         self._clones = config.method == "bc"
         self._mirror: Mirror | None = None
         self._expert_frames: jax.Array | None = None
@@ -67,28 +61,13 @@ class Updates:
     def _samples_expert(self) -> bool:
         return self._clones or self._agent.rewarder.samples_expert
 
-    def collect(self, num_steps: int) -> bool:
+    def collect(self, rng: np.random.Generator) -> bool:
         """Draws for one update; says whether there are enough to be run.
 
         Until they are run, no episode may enter the replay.
-
-        Args:
-          num_steps: decisions made when the update is due.
         """
-        ahead, self._ahead = self._ahead, None
-        if ahead is not None and ahead[0] == num_steps:
-            self._pending.append(ahead[1])
-        else:
-            self._pending.append(self.draw(self._draws(num_steps)))
+        self._pending.append(self.draw(rng))
         return len(self._pending) >= self._config.updates_per_dispatch
-
-    def draw_ahead(self, num_steps: int) -> None:
-        """Draws for a later update now, while the device is busy with one.
-
-        It is the same batch, unless an episode enters the replay: then it is drawn
-        again when it is due.
-        """
-        self._ahead = num_steps, self.draw(self._draws(num_steps))
 
     def run(self, state: TrainState) -> tuple[TrainState, Metrics | None]:
         """Runs what is collected.
@@ -112,7 +91,6 @@ class Updates:
 
     def episode_added(self) -> None:
         """Follows the replay, after an episode has entered it."""
-        self._ahead = None
         if self._mirror is not None:
             self._mirror.refresh()
 

@@ -163,37 +163,6 @@ def test_frames_on_the_device_change_no_number(tmp_path):
     assert _compilations(there.agent.update_step) == 2  # one of each run
 
 
-@pytest.mark.parametrize(
-    "changes", [{}, {"update_every_steps": 2}, {"num_environments": 2}]
-)
-def test_batches_drawn_ahead_are_those_that_are_due(tmp_path, changes):
-    run = make_run(tmp_path, **changes)
-    updates: Any = run.updates
-    draws, collect = [], updates.collect
-    draw = updates.draw
-    updates.draw = lambda rng: draws.append(1) or draw(rng)
-
-    def collect_and_compare(num_steps):
-        before = len(draws)
-        enough = collect(num_steps)
-        used_ahead.append(len(draws) == before)
-        due = draw(run._rng(train._SAMPLED_BATCHES, num_steps))
-        for ours, theirs in zip(
-            jax.tree.leaves(updates._pending[-1]), jax.tree.leaves(due), strict=True
-        ):
-            np.testing.assert_array_equal(ours, theirs)
-        return enough
-
-    used_ahead: list[bool] = []
-    updates.collect = collect_and_compare
-    finished(run)
-    assert len(used_ahead) == run.state.num_updates
-    # Not ahead: the first, and the first after each round of episodes has entered.
-    together = run.config.num_environments
-    rounds = range(together, EPISODES, together)
-    assert used_ahead.count(False) == len(rounds)
-
-
 def test_groups_of_updates_end_with_the_episode_and_resume_bit_for_bit(tmp_path):
     changes = {"replay_on_device": True, "updates_per_dispatch": 4}
     unbroken = make_run(tmp_path / "unbroken", **changes)
