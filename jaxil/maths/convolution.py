@@ -1,6 +1,7 @@
-"""Convolution, with a shorter way back to images whose windows do not overlap."""
+"""Convolution, with gradients that take less of a processor's time and memory."""
 
-from typing import Any
+import functools
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -8,6 +9,24 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 _LAYOUT = ("NHWC", "HWIO", "NHWC")
+
+
+class _Settings(NamedTuple):
+    """Of a VALID convolution of channels-last images."""
+
+    strides: tuple[int, ...]
+    precision: Any
+    saves_memory: bool
+
+    def apply(self, images: Array, kernel: Array) -> Array:
+        return lax.conv_general_dilated(
+            images,
+            kernel,
+            self.strides,
+            "VALID",
+            dimension_numbers=_LAYOUT,
+            precision=self.precision,
+        )
 
 
 def convolve(
@@ -21,12 +40,13 @@ def convolve(
     dimension_numbers: Any = None,
     feature_group_count: int = 1,
     precision: Any = None,
+    saves_memory: bool = False,
 ) -> Array:
     """Does what `jax.lax.conv_general_dilated` does, whose signature it has.
 
-    Of VALID convolutions whose strides are their kernel's sides, the gradient is
-    `tile_gradient`, which a gradient penalty differentiates a second time: XLA's own
-    form of that takes a fifth of DAC's update on a CPU.
+    Where windows do not overlap, the images' gradient is `tile_gradient`, which a
+    gradient penalty differentiates a second time: XLA's own form of that takes a fifth
+    of DAC's update on a CPU.
 
     Args:
       images: shape [B, H, W, C].
@@ -34,21 +54,23 @@ def convolve(
       strides: along H and W.
       padding, lhs_dilation, rhs_dilation, dimension_numbers, feature_group_count,
         precision: see jax.
+      saves_memory: whether XLA has to wait with the transposed copy of the images that
+        it makes for the kernel's gradient on a CPU.
 
     Returns:
       Shape [B, (H - h) // stride + 1, (W - w) // stride + 1, F] if padding is VALID.
     """
     chex.assert_rank([images, kernel], 4)
     layout = lax.conv_dimension_numbers(images.shape, kernel.shape, _LAYOUT)
-    of_tiles = (
-        kernel.shape[:2] == tuple(strides)
-        and padding == "VALID"
+    is_plain = (
+        padding == "VALID"
         and set(lhs_dilation or [1]) == set(rhs_dilation or [1]) == {1}
         and dimension_numbers in (_LAYOUT, layout)
         and feature_group_count == 1
     )
-    if of_tiles:
-        return _convolve_tiles(precision, images, kernel)
+    if is_plain:
+        settings = _Settings(tuple(strides), precision, saves_memory)
+        return _convolve(settings, images, kernel)
     return lax.conv_general_dilated(
         images,
         kernel,
@@ -62,36 +84,37 @@ def convolve(
     )
 
 
-def _by_xla(precision: Any, images: Array, kernel: Array) -> Array:
-    return lax.conv_general_dilated(
-        images,
-        kernel,
-        kernel.shape[:2],
-        "VALID",
-        dimension_numbers=_LAYOUT,
-        precision=precision,
-    )
-
-
-_convolve_tiles = jax.custom_vjp(_by_xla, nondiff_argnums=(0,))
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _convolve(settings: _Settings, images: Array, kernel: Array) -> Array:
+    return settings.apply(images, kernel)
 
 
 def _forward(
-    precision: Any, images: Array, kernel: Array
+    settings: _Settings, images: Array, kernel: Array
 ) -> tuple[Array, tuple[Array, Array]]:
-    return _convolve_tiles(precision, images, kernel), (images, kernel)
+    return _convolve(settings, images, kernel), (images, kernel)
 
 
 def _backward(
-    precision: Any, saved: tuple[Array, Array], cotangent: Array
+    settings: _Settings, saved: tuple[Array, Array], cotangent: Array
 ) -> tuple[Array, Array]:
     images, kernel = saved
-    _, to_kernel = jax.vjp(lambda k: _by_xla(precision, images, k), kernel)
-    size = images.shape[1:3]
-    return tile_gradient(cotangent, kernel, size, precision), *to_kernel(cotangent)
+    if kernel.shape[:2] == settings.strides:
+        size, precision = images.shape[1:3], settings.precision
+        image_gradient = tile_gradient(cotangent, kernel, size, precision)
+    else:
+        _, to_images = jax.vjp(lambda x: settings.apply(x, kernel), images)
+        (image_gradient,) = to_images(cotangent)
+    if settings.saves_memory:
+        # XLA's CPU compiler makes the copy as soon as it has the images, in the forward
+        # pass, and keeps all copies of all layers until they are needed. It drops
+        # barriers before it orders operations, but keeps what a number depends on.
+        images += 0.0 * cotangent[0, 0, 0, 0]
+    _, to_kernel = jax.vjp(lambda k: settings.apply(images, k), kernel)
+    return image_gradient, *to_kernel(cotangent)
 
 
-_convolve_tiles.defvjp(_forward, _backward)
+_convolve.defvjp(_forward, _backward)
 
 
 def tile_gradient(

@@ -1,5 +1,6 @@
 """From observations to the representation that actor and critic share."""
 
+import functools
 import math
 from typing import Any
 
@@ -56,7 +57,9 @@ class PixelEncoder(nn.Module):
                 padding="VALID",
                 kernel_init=nn.initializers.orthogonal(scale=math.sqrt(2.0)),
                 dtype=self.dtype,
-                conv_general_dilated=convolution.convolve,
+                conv_general_dilated=functools.partial(
+                    convolution.convolve, saves_memory=self.chunk_size > 0
+                ),
             )(x)
             x = nn.relu(x)
         return x.reshape(x.shape[0], -1)
