@@ -26,6 +26,7 @@ COSTS = ("cosine", "euclidean")
 ALIGNMENTS = ("transport", "time")
 RENDER_QUALITIES = ("paper", "fast", "smooth")
 COMPUTE_DTYPES = ("float32", "bfloat16")
+CONVOLUTIONS = ("auto", "native", "xla")
 
 # The paper's budgets, in environment frames; other tasks get the larger one.
 _EASY_TASKS = ("cartpole_swingup", "finger_spin", "ball_in_cup_catch")
@@ -82,8 +83,11 @@ def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Conf
     config.encoder.contrast = 1.0
     config.encoder.subtract_mean_image = False  # the demonstrations' mean, not 0.5
     # On CPUs so many images are encoded at a time; see `networks.encoder.encode`. 0
-    # encodes a batch at once, in XLA's own form.
+    # encodes a batch at once.
     config.encoder.chunk_size = 8
+    # On CPUs with a C compiler our own are used, in float32; "xla" never, "native" or
+    # not at all; see `jaxil.native`.
+    config.encoder.convolutions = "auto"
 
     config.demonstrations = ml_collections.ConfigDict()
     config.demonstrations.source = ""  # a file or folder; "" is the shipped file
@@ -269,6 +273,9 @@ def _problems(config: Config, known_tasks: tuple[str, ...]) -> Iterator[str]:
         yield unknown_name("observation", config.observation, OBSERVATIONS)
     if config.compute_dtype not in COMPUTE_DTYPES:
         yield unknown_name("compute_dtype", config.compute_dtype, COMPUTE_DTYPES)
+    if config.encoder.convolutions not in CONVOLUTIONS:
+        value = config.encoder.convolutions
+        yield unknown_name("encoder.convolutions", value, CONVOLUTIONS)
     if config.render_quality not in RENDER_QUALITIES:
         yield unknown_name("render_quality", config.render_quality, RENDER_QUALITIES)
     for field, known in (("cost", COSTS), ("alignment", ALIGNMENTS)):

@@ -9,7 +9,7 @@ import numpy as np
 import optax
 
 from jaxil import config as jaxil_config
-from jaxil import platform
+from jaxil import native, platform
 from jaxil.config import Config
 from jaxil.host import demonstrations as host_demonstrations
 from jaxil.host.environment import (
@@ -87,6 +87,15 @@ def problems(config: Config) -> list[str]:
     Reads the demonstration file, but renders nothing.
     """
     faults = jaxil_config.problems(config, known_tasks())
+    if config.encoder.convolutions == "native":
+        fault = native.problem()
+        if config.compute_dtype != "float32":
+            fault = f"they are for float32, not compute_dtype={config.compute_dtype!r}"
+        if fault is not None:
+            faults.append(
+                f"encoder.convolutions='native' can't be had: {fault}; 'auto' takes "
+                "XLA's where it has to"
+            )
     readable = config.task in known_tasks() and not any(
         fault.startswith(_READING_FIELDS) for fault in faults
     )
@@ -283,12 +292,19 @@ def make_networks(config: Config, action_dim: int, mean: Any) -> AgentNetworks:
         mean=mean,
         compute_dtype=config.compute_dtype,
         chunk_size=chunk_size(config),
+        native=uses_native_convolutions(config),
     )
 
 
 def chunk_size(config: Config) -> int:
     """Returns how many images are encoded at a time: 0, all of them, but on CPUs."""
     return config.encoder.chunk_size if jax.default_backend() == "cpu" else 0
+
+
+def uses_native_convolutions(config: Config) -> bool:
+    """Returns whether the encoder's convolutions are our own, and loads them if so."""
+    wanted = config.encoder.convolutions != "xla" and config.observation == "pixels"
+    return wanted and config.compute_dtype == "float32" and native.problem() is None
 
 
 def mean_image(

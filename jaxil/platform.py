@@ -66,7 +66,7 @@ def prepare() -> str:
             os.environ["XLA_FLAGS"] = f"{flags} {_NO_YNN_FUSION}".strip()
             os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(_compilation_folder())
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(compilation_folder())
         # Without these, what compiles in under a second is compiled every time.
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
@@ -219,7 +219,7 @@ def _tell_imported_jax() -> None:
         jax.config.update(name, kind(os.environ[name.upper()]))
 
 
-def _compilation_folder() -> pathlib.Path:
+def compilation_folder() -> pathlib.Path:
     """Returns the folder of compiled programs for this kind of CPU and this jaxlib.
 
     Home folders are shared between machines, and code that was compiled for one CPU

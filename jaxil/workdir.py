@@ -11,8 +11,8 @@ from typing import Any
 from jaxil.command import UsageError
 from jaxil.config import Config, default_config
 
-# A run may be prolonged, or go on in other chunks, without becoming another run.
-_FREE_FIELDS = ("total_frames", "encoder.chunk_size")
+# A run may be prolonged, or be computed in another way, without becoming another run.
+_FREE_FIELDS = ("total_frames", "encoder.chunk_size", "encoder.convolutions")
 
 
 def problems(workdir: pathlib.Path, config: Config) -> list[str]:

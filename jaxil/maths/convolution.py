@@ -1,4 +1,4 @@
-"""Convolution, with gradients that take less of a processor's time and memory."""
+"""Convolution with ReLU, in two forms: XLA's, and our own for CPUs in convolution.c."""
 
 import functools
 from typing import Any, NamedTuple
@@ -6,120 +6,80 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
-_LAYOUT = ("NHWC", "HWIO", "NHWC")
+# Our own takes features by two vectors of a processor; no CPU's vectors are longer.
+_NATIVE_FEATURES = 32
 
 
-class _Settings(NamedTuple):
-    """Of a VALID convolution of channels-last images."""
-
-    strides: tuple[int, ...]
-    precision: Any
-    saves_memory: bool
-
-    def apply(self, images: Array, kernel: Array) -> Array:
-        return lax.conv_general_dilated(
-            images,
-            kernel,
-            self.strides,
-            "VALID",
-            dimension_numbers=_LAYOUT,
-            precision=self.precision,
-        )
-
-
-def convolve(
-    images: Array,
-    kernel: Array,
-    strides: tuple[int, int],
-    padding: Any,
-    *,
-    lhs_dilation: Any = None,
-    rhs_dilation: Any = None,
-    dimension_numbers: Any = None,
-    feature_group_count: int = 1,
-    precision: Any = None,
-    saves_memory: bool = False,
+def convolve_relu(
+    images: Array, kernel: Array, bias: Array, stride: int, *, native: bool = False
 ) -> Array:
-    """Does what `jax.lax.conv_general_dilated` does, whose signature it has.
+    """Returns the ReLU of a VALID convolution.
 
-    Where windows do not overlap, the images' gradient is `tile_gradient`, which a
-    gradient penalty differentiates a second time: XLA's own form of that takes a fifth
-    of DAC's update on a CPU.
+        y[i, j, f] = max(0, b[f] + sum_{u,v,c} x[s i + u, s j + v, c] k[u, v, c, f])
 
     Args:
       images: shape [B, H, W, C].
       kernel: shape [h, w, C, F].
-      strides: along H and W.
-      padding, lhs_dilation, rhs_dilation, dimension_numbers, feature_group_count,
-        precision: see jax.
-      saves_memory: whether XLA has to wait with the transposed copy of the images that
-        it makes for the kernel's gradient on a CPU.
+      bias: shape [F].
+      stride: s, along H and W.
+      native: whether our own form computes it where it can, which is for float32 and F
+        a multiple of 32; `jaxil.native` has to be loaded. It can be differentiated
+        once; XLA's form any number of times.
 
     Returns:
-      Shape [B, (H - h) // stride + 1, (W - w) // stride + 1, F] if padding is VALID.
+      Shape [B, (H - h) // s + 1, (W - w) // s + 1, F].
     """
-    chex.assert_rank([images, kernel], 4)
-    layout = lax.conv_dimension_numbers(images.shape, kernel.shape, _LAYOUT)
-    is_plain = (
-        padding == "VALID"
-        and set(lhs_dilation or [1]) == set(rhs_dilation or [1]) == {1}
-        and dimension_numbers in (_LAYOUT, layout)
-        and feature_group_count == 1
-    )
-    if is_plain:
-        settings = _Settings(tuple(strides), precision, saves_memory)
-        return _convolve(settings, images, kernel)
+    chex.assert_rank([images, kernel, bias], [4, 4, 1])
+    chex.assert_equal(bias.shape[0], kernel.shape[3])
+    fits = kernel.shape[3] % _NATIVE_FEATURES == 0
+    if native and fits and images.dtype == jnp.float32:
+        return _native(stride, images, kernel, bias)
+    return jax.nn.relu(_convolve(stride, images, kernel) + bias)
+
+
+def _plain(stride: int, images: Array, kernel: Array) -> Array:
+    numbers = ("NHWC", "HWIO", "NHWC")
+    strides = (stride, stride)
     return lax.conv_general_dilated(
-        images,
-        kernel,
-        strides,
-        padding,
-        lhs_dilation=lhs_dilation,
-        rhs_dilation=rhs_dilation,
-        dimension_numbers=dimension_numbers,
-        feature_group_count=feature_group_count,
-        precision=precision,
+        images, kernel, strides, "VALID", dimension_numbers=numbers
     )
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _convolve(settings: _Settings, images: Array, kernel: Array) -> Array:
-    return settings.apply(images, kernel)
+def _convolve(stride: int, images: Array, kernel: Array) -> Array:
+    """Convolves; where windows do not overlap, with `tile_gradient`.
+
+    A gradient penalty on pixels differentiates it a second time: XLA's own form of that
+    takes a fifth of DAC's update on a CPU.
+    """
+    return _plain(stride, images, kernel)
 
 
 def _forward(
-    settings: _Settings, images: Array, kernel: Array
+    stride: int, images: Array, kernel: Array
 ) -> tuple[Array, tuple[Array, Array]]:
-    return _convolve(settings, images, kernel), (images, kernel)
+    return _convolve(stride, images, kernel), (images, kernel)
 
 
 def _backward(
-    settings: _Settings, saved: tuple[Array, Array], cotangent: Array
+    stride: int, saved: tuple[Array, Array], cotangent: Array
 ) -> tuple[Array, Array]:
     images, kernel = saved
-    if kernel.shape[:2] == settings.strides:
-        size, precision = images.shape[1:3], settings.precision
-        image_gradient = tile_gradient(cotangent, kernel, size, precision)
-    else:
-        _, to_images = jax.vjp(lambda x: settings.apply(x, kernel), images)
-        (image_gradient,) = to_images(cotangent)
-    if settings.saves_memory:
-        # XLA's CPU compiler makes the copy as soon as it has the images, in the forward
-        # pass, and keeps all copies of all layers until they are needed. It drops
-        # barriers before it orders operations, but keeps what a number depends on.
-        images += 0.0 * cotangent[0, 0, 0, 0]
-    _, to_kernel = jax.vjp(lambda k: settings.apply(images, k), kernel)
-    return image_gradient, *to_kernel(cotangent)
+    image_gradient, kernel_gradient = jax.vjp(
+        functools.partial(_plain, stride), images, kernel
+    )[1](cotangent)
+    if kernel.shape[:2] == (stride, stride):
+        image_gradient = tile_gradient(cotangent, kernel, images.shape[1:3])
+    return image_gradient, kernel_gradient
 
 
 _convolve.defvjp(_forward, _backward)
 
 
-def tile_gradient(
-    cotangent: Array, kernel: Array, size: tuple[int, ...], precision: Any = None
-) -> Array:
+def tile_gradient(cotangent: Array, kernel: Array, size: tuple[int, ...]) -> Array:
     """Returns what a cotangent of a convolution of tiles means for the images.
 
         dx[h i + u, w j + v] = k[u, v] dy[i, j]
@@ -130,16 +90,75 @@ def tile_gradient(
       cotangent: shape [B, H // h, W // w, F].
       kernel: shape [h, w, C, F].
       size: H and W; what no window reaches gets 0.
-      precision: of the product, as in jax.
 
     Returns:
       Shape [B, H, W, C].
     """
     chex.assert_rank([cotangent, kernel], 4)
-    tiles = jnp.einsum("bijf,uvcf->biujvc", cotangent, kernel, precision=precision)
+    tiles = jnp.einsum("bijf,uvcf->biujvc", cotangent, kernel)
     batch, rows, height, columns, width, channels = tiles.shape
     seen = tiles.reshape(batch, rows * height, columns * width, channels)
     unseen = [
         (0, full - used) for full, used in zip(size, seen.shape[1:3], strict=True)
     ]
     return jnp.pad(seen, [(0, 0), *unseen, (0, 0)])
+
+
+class _Saved(NamedTuple):
+    """What the gradients of our own form need; y tells where ReLU let pass."""
+
+    images: Array
+    kernel: Array
+    y: Array
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _native(stride: int, images: Array, kernel: Array, bias: Array) -> Array:
+    height, width = (
+        (n - k) // stride + 1 for n, k in zip(images.shape[1:3], kernel.shape)
+    )
+    shape = (images.shape[0], height, width, kernel.shape[3])
+    return _call("jaxil_convolve_relu", shape, images, kernel, bias, stride=stride)
+
+
+def _native_forward(
+    stride: int, images: Array, kernel: Array, bias: Array
+) -> tuple[Array, _Saved]:
+    y = _native(stride, images, kernel, bias)
+    return y, _Saved(images, kernel, y)
+
+
+def _native_backward(
+    stride: int, saved: _Saved, cotangent: Array
+) -> tuple[Array, Array, Array]:
+    images, kernel, y = saved
+    kernel_gradient, bias_gradient = _call(
+        "jaxil_kernel_gradient",
+        (kernel.shape, kernel.shape[3:]),
+        images,
+        y,
+        cotangent,
+        stride=stride,
+    )
+    if stride == 1 and kernel.shape[2] % _NATIVE_FEATURES == 0:
+        image_gradient = _call(
+            "jaxil_image_gradient", images.shape, kernel, y, cotangent, stride=stride
+        )
+    else:  # an encoder's first layer, whose images nobody asks the gradient of
+        _, to_images = jax.vjp(lambda x: _plain(stride, x, kernel), images)
+        (image_gradient,) = to_images(jnp.where(y > 0, cotangent, 0.0))
+    return image_gradient, kernel_gradient, bias_gradient
+
+
+_native.defvjp(_native_forward, _native_backward)
+
+
+def _call(name: str, shape: Any, *arguments: Array, stride: int) -> Any:
+    """Calls a function of convolution.c that returns arrays of these shapes."""
+    results = jax.tree.map(
+        lambda s: jax.ShapeDtypeStruct(s, jnp.float32),
+        shape,
+        is_leaf=lambda s: all(isinstance(n, int) for n in s),
+    )
+    call = jax.ffi.ffi_call(name, results, vmap_method="sequential")
+    return call(*arguments, stride=np.int64(stride))

@@ -32,6 +32,7 @@ def make_agent_networks(
     mean: Any,
     compute_dtype: str = "float32",
     chunk_size: int = 0,
+    native: bool = False,
 ) -> AgentNetworks:
     """Returns the networks of DrQ-v2.
 
@@ -48,13 +49,21 @@ def make_agent_networks(
       compute_dtype: "float32" or "bfloat16", of the convolutions and of the product
         that follows them.
       chunk_size: see `PixelEncoder`.
+      native: see `PixelEncoder`.
     """
     dtype = jnp.dtype(compute_dtype)
     if observation == "state":
         encoder = StateEncoder(hidden_dim)
     else:
         encoder = PixelEncoder(
-            channels, kernel_sizes, strides, contrast, mean, dtype, chunk_size
+            channels,
+            kernel_sizes,
+            strides,
+            contrast,
+            mean,
+            dtype,
+            chunk_size,
+            native,
         )
     return AgentNetworks(
         encoder=encoder,

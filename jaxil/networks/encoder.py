@@ -1,7 +1,5 @@
 """From observations to the representation that actor and critic share."""
 
-import functools
-import math
 from typing import Any
 
 import chex
@@ -10,9 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxil.maths import convolution
 from jaxil.maths.types import Data, Params
-from jaxil.networks.layers import dense
+from jaxil.networks.layers import ConvolutionReLU, dense
 
 
 class PixelEncoder(nn.Module):
@@ -29,6 +26,7 @@ class PixelEncoder(nn.Module):
         [H, W, C] as nested tuples or an array.
       dtype: of the convolutions; parameters are float32 whatever it is.
       chunk_size: images that `encode` takes at a time; 0 for all.
+      native: see `convolution.convolve_relu`.
 
     Source: facebookresearch/drqv2, drqv2.py, `Encoder`.
     """
@@ -40,6 +38,7 @@ class PixelEncoder(nn.Module):
     mean: Any = 0.5
     dtype: Any = jnp.float32
     chunk_size: int = 0
+    native: bool = False
 
     @nn.compact
     def __call__(self, observation: Array) -> Array:
@@ -49,19 +48,11 @@ class PixelEncoder(nn.Module):
         mean = jnp.asarray(self.mean, jnp.float32)
         x = self.contrast * (x - (mean[None] if mean.ndim else mean))
         layers = zip(self.channels, self.kernel_sizes, self.strides, strict=True)
-        for features, size, stride in layers:
-            x = nn.Conv(
-                features,
-                kernel_size=(size, size),
-                strides=(stride, stride),
-                padding="VALID",
-                kernel_init=nn.initializers.orthogonal(scale=math.sqrt(2.0)),
-                dtype=self.dtype,
-                conv_general_dilated=functools.partial(
-                    convolution.convolve, saves_memory=self.chunk_size > 0
-                ),
-            )(x)
-            x = nn.relu(x)
+        for k, (features, size, stride) in enumerate(layers):
+            layer = ConvolutionReLU(
+                features, size, stride, self.dtype, self.native, name=f"Conv_{k}"
+            )
+            x = layer(x)
         return x.reshape(x.shape[0], -1)
 
 

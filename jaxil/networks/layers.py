@@ -1,11 +1,14 @@
 """Building blocks that several networks share."""
 
+import math
 from typing import Any
 
 import chex
 import flax.linen as nn
 import jax.numpy as jnp
 from jax import Array
+
+from jaxil.maths import convolution
 
 _LAYER_NORM_EPSILON = 1e-5  # PyTorch's default; flax's own is 1e-6
 
@@ -23,6 +26,39 @@ def dense(features: int, name: str | None = None, dtype: Any = jnp.float32) -> n
     return nn.Dense(
         features, kernel_init=nn.initializers.orthogonal(), name=name, dtype=dtype
     )
+
+
+class ConvolutionReLU(nn.Module):
+    """A VALID convolution with ReLU, orthogonal with the gain of ReLU, and bias 0.
+
+    Attributes:
+      features: F, output channels.
+      kernel_size: side of the square kernel.
+      stride: along both sides.
+      dtype: of the convolution; parameters are float32 whatever it is.
+      native: see `convolution.convolve_relu`.
+
+    Source: facebookresearch/drqv2, utils.py, `weight_init`.
+    """
+
+    features: int
+    kernel_size: int
+    stride: int
+    dtype: Any = jnp.float32
+    native: bool = False
+
+    @nn.compact
+    def __call__(self, images: Array) -> Array:
+        """Maps [B, H, W, C] to [B, H', W', F] of `dtype`."""
+        chex.assert_rank(images, 4)
+        shape = (self.kernel_size, self.kernel_size, images.shape[-1], self.features)
+        gain = nn.initializers.orthogonal(scale=math.sqrt(2.0))
+        kernel = self.param("kernel", gain, shape)
+        bias = self.param("bias", nn.initializers.zeros, (self.features,))
+        images, kernel, bias = (x.astype(self.dtype) for x in (images, kernel, bias))
+        return convolution.convolve_relu(
+            images, kernel, bias, self.stride, native=self.native
+        )
 
 
 class Trunk(nn.Module):

@@ -18,6 +18,7 @@ _FREE_FIELDS = (
     "checkpoint_every_frames",
     "video_every_evals",
     "encoder.chunk_size",
+    "encoder.convolutions",
 )
 # The name of the variant, or of the panel, says these already.
 _NAMED_FIELDS = (

@@ -18,6 +18,7 @@ from jaxil.maths.types import (
 )
 from jaxil.networks.agent import AgentNetworks, apply
 from jaxil.networks.discriminator import PixelDiscriminator
+from jaxil.networks.encoder import PixelEncoder
 from jaxil.rewarders.discrimination import update_discriminator
 from jaxil.rewarders.rewarder import AgentView, Rewarder, Spec
 
@@ -54,7 +55,10 @@ def make_dac_rewarder(
     Source: Kostrikov et al. 2019, arXiv:1809.02925, on pixels as in Cohen et al. 2021,
     sec. 4.1.
     """
-    discriminator = PixelDiscriminator(networks.encoder, feature_dim, hidden_dim)
+    encoder = networks.encoder
+    if isinstance(encoder, PixelEncoder):  # the penalty differentiates it twice
+        encoder = encoder.clone(native=False)
+    discriminator = PixelDiscriminator(encoder, feature_dim, hidden_dim)
     optimiser = optax.adam(learning_rate)
 
     def inputs(observation: Array, action: Array) -> Inputs:

@@ -1,0 +1,89 @@
+"""Our own convolution in C, compiled for this machine's processor, known to XLA.
+
+XLA's reach two thirds of what a CPU core can do, and these all of it, see
+`launch/results/speed.md`, 10. The C compiler is the machine's. Where there is none, and
+on other devices, XLA's own are used.
+"""
+
+import ctypes
+import functools
+import hashlib
+import os
+import pathlib
+import shutil
+import subprocess
+
+import jax
+
+from jaxil import platform
+
+_SOURCE = pathlib.Path(__file__).parent / "maths" / "convolution.c"
+_FUNCTIONS = ("jaxil_convolve_relu", "jaxil_kernel_gradient", "jaxil_image_gradient")
+_COMPILERS = ("gcc", "cc", "clang")
+_FLAGS = ("-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared")
+_SECONDS = 60.0  # it takes 1
+
+
+@functools.cache
+def problem() -> str | None:
+    """Compiles the library, unless that was done before, and tells XLA about it.
+
+    Returns:
+      None if it can be used, else why it can't.
+    """
+    if jax.default_backend() != "cpu":
+        return f"it is for CPUs, and jax computes on {jax.default_backend()}"
+    try:
+        library = ctypes.CDLL(str(build(platform.compilation_folder())))
+    except (BuildError, OSError) as error:
+        return str(error)
+    for name in _FUNCTIONS:
+        target = jax.ffi.pycapsule(getattr(library, name))
+        jax.ffi.register_ffi_target(name, target, platform="cpu")
+    return None
+
+
+class BuildError(Exception):
+    """The library can't be compiled; the message says why and what helps."""
+
+
+def build(folder: pathlib.Path, flags: tuple[str, ...] = _FLAGS) -> pathlib.Path:
+    """Returns the library's file in a folder, compiled if it isn't there.
+
+    Args:
+      folder: is made; processes may share it, processors may not.
+      flags: for the compiler.
+
+    Raises:
+      BuildError: there is no compiler, or it failed.
+    """
+    digest = hashlib.sha256(_SOURCE.read_bytes() + repr(flags).encode()).hexdigest()[:8]
+    path = folder / f"convolution-{digest}.so"
+    if path.exists():
+        return path
+    compiler = os.environ.get("CC") or next(filter(shutil.which, _COMPILERS), None)
+    if compiler is None:
+        raise BuildError("there is no C compiler: `apt-get install gcc` brings one")
+    temporary = folder / f"{path.name}.{os.getpid()}.tmp"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        done = subprocess.run(
+            [*compiler.split(), *flags, f"-I{_headers()}", "-o", temporary, _SOURCE],
+            capture_output=True,
+            text=True,
+            timeout=_SECONDS,
+        )
+        if done.returncode:
+            last = (done.stderr.strip() or "no message").splitlines()[-1]
+            raise BuildError(f"{compiler} can't compile {_SOURCE.name}: {last}")
+        os.replace(temporary, path)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise BuildError(f"{compiler} can't be run: {error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def _headers() -> pathlib.Path:
+    """Returns the folder of XLA's headers, which are part of jaxlib."""
+    return pathlib.Path(jax.ffi.include_dir())
