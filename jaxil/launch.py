@@ -39,7 +39,9 @@ def main(argv: list[str]) -> int:
     with workdir.opened(folder):
         try:
             gl_name = experiment.renderer_name(config)
-            workdir.write_config(folder, config, machine.describe(gl_name))
+            native = experiment.uses_native_convolutions(config)
+            description = machine.describe(gl_name, native=native)
+            workdir.write_config(folder, config, description)
             finished = train.train(config, folder)
         except (train.TrainingDiverged, EnvironmentsFailed) as error:
             print(f"training stopped: {error}", file=sys.stderr)

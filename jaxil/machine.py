@@ -23,11 +23,12 @@ _PACKAGES = (
 _BESIDE_THE_REPLAY = 1.5e9
 
 
-def describe(gl_name: str) -> dict[str, Any]:
+def describe(gl_name: str, *, native: bool) -> dict[str, Any]:
     """Returns what config.json says about the machine.
 
     Args:
       gl_name: the renderer's name for itself.
+      native: whether the encoder's convolutions are our own.
     """
     return {
         "versions": {
@@ -35,6 +36,7 @@ def describe(gl_name: str) -> dict[str, Any]:
             **{name: importlib.metadata.version(name) for name in _PACKAGES},
         },
         "device": device_name(),
+        "convolutions": "native" if native else "xla",
         "renderer": gl_name,
     }
 

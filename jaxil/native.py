@@ -20,7 +20,7 @@ from jaxil import platform
 _SOURCE = pathlib.Path(__file__).parent / "maths" / "convolution.c"
 _FUNCTIONS = ("jaxil_convolve_relu", "jaxil_kernel_gradient", "jaxil_image_gradient")
 _COMPILERS = ("gcc", "cc", "clang")
-_FLAGS = ("-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared")
+FLAGS = ("-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared")
 _SECONDS = 60.0  # it takes 1
 
 
@@ -37,9 +37,7 @@ def problem() -> str | None:
         library = ctypes.CDLL(str(build(platform.compilation_folder())))
     except (BuildError, OSError) as error:
         return str(error)
-    for name in _FUNCTIONS:
-        target = jax.ffi.pycapsule(getattr(library, name))
-        jax.ffi.register_ffi_target(name, target, platform="cpu")
+    register(library)
     return None
 
 
@@ -47,7 +45,14 @@ class BuildError(Exception):
     """The library can't be compiled; the message says why and what helps."""
 
 
-def build(folder: pathlib.Path, flags: tuple[str, ...] = _FLAGS) -> pathlib.Path:
+def register(library: ctypes.CDLL) -> None:
+    """Tells XLA where the functions are that `maths.convolution` calls."""
+    for name in _FUNCTIONS:
+        target = jax.ffi.pycapsule(getattr(library, name))
+        jax.ffi.register_ffi_target(name, target, platform="cpu")
+
+
+def build(folder: pathlib.Path, flags: tuple[str, ...] = FLAGS) -> pathlib.Path:
     """Returns the library's file in a folder, compiled if it isn't there.
 
     Args:

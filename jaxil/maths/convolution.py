@@ -36,8 +36,8 @@ def convolve_relu(
     chex.assert_equal(bias.shape[0], kernel.shape[3])
     fits = kernel.shape[3] % _NATIVE_FEATURES == 0
     if native and fits and images.dtype == jnp.float32:
-        return _native(stride, images, kernel, bias)
-    return jax.nn.relu(_convolve(stride, images, kernel) + bias)
+        return _NATIVE(stride, images, kernel, bias)
+    return jax.nn.relu(_XLA(stride, images, kernel) + bias[None, None, None])
 
 
 def _plain(stride: int, images: Array, kernel: Array) -> Array:
@@ -48,35 +48,27 @@ def _plain(stride: int, images: Array, kernel: Array) -> Array:
     )
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _convolve(stride: int, images: Array, kernel: Array) -> Array:
-    """Convolves; where windows do not overlap, with `tile_gradient`.
-
-    A gradient penalty on pixels differentiates it a second time: XLA's own form of that
-    takes a fifth of DAC's update on a CPU.
-    """
-    return _plain(stride, images, kernel)
-
-
 def _forward(
     stride: int, images: Array, kernel: Array
 ) -> tuple[Array, tuple[Array, Array]]:
-    return _convolve(stride, images, kernel), (images, kernel)
+    return _XLA(stride, images, kernel), (images, kernel)
 
 
 def _backward(
     stride: int, saved: tuple[Array, Array], cotangent: Array
 ) -> tuple[Array, Array]:
     images, kernel = saved
-    image_gradient, kernel_gradient = jax.vjp(
-        functools.partial(_plain, stride), images, kernel
-    )[1](cotangent)
+    _, to_both = jax.vjp(functools.partial(_plain, stride), images, kernel)
+    image_gradient, kernel_gradient = to_both(cotangent)
     if kernel.shape[:2] == (stride, stride):
+        # A penalty on pixels differentiates this once more: XLA's own form of that
+        # takes a fifth of DAC's update on a CPU.
         image_gradient = tile_gradient(cotangent, kernel, images.shape[1:3])
     return image_gradient, kernel_gradient
 
 
-_convolve.defvjp(_forward, _backward)
+_XLA: Any = jax.custom_vjp(_plain, nondiff_argnums=(0,))
+_XLA.defvjp(_forward, _backward)
 
 
 def tile_gradient(cotangent: Array, kernel: Array, size: tuple[int, ...]) -> Array:
@@ -112,13 +104,12 @@ class _Saved(NamedTuple):
     y: Array
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _native(stride: int, images: Array, kernel: Array, bias: Array) -> Array:
     height, width = (
         (n - k) // stride + 1 for n, k in zip(images.shape[1:3], kernel.shape)
     )
-    shape = (images.shape[0], height, width, kernel.shape[3])
-    return _call("jaxil_convolve_relu", shape, images, kernel, bias, stride=stride)
+    y = _array(images.shape[0], height, width, kernel.shape[3])
+    return _call("jaxil_convolve_relu", y, stride, images, kernel, bias)
 
 
 def _native_forward(
@@ -132,17 +123,13 @@ def _native_backward(
     stride: int, saved: _Saved, cotangent: Array
 ) -> tuple[Array, Array, Array]:
     images, kernel, y = saved
+    gradients = _array(*kernel.shape), _array(kernel.shape[3])
     kernel_gradient, bias_gradient = _call(
-        "jaxil_kernel_gradient",
-        (kernel.shape, kernel.shape[3:]),
-        images,
-        y,
-        cotangent,
-        stride=stride,
+        "jaxil_kernel_gradient", gradients, stride, images, y, cotangent
     )
     if stride == 1 and kernel.shape[2] % _NATIVE_FEATURES == 0:
         image_gradient = _call(
-            "jaxil_image_gradient", images.shape, kernel, y, cotangent, stride=stride
+            "jaxil_image_gradient", _array(*images.shape), stride, kernel, y, cotangent
         )
     else:  # an encoder's first layer, whose images nobody asks the gradient of
         _, to_images = jax.vjp(lambda x: _plain(stride, x, kernel), images)
@@ -150,15 +137,15 @@ def _native_backward(
     return image_gradient, kernel_gradient, bias_gradient
 
 
-_native.defvjp(_native_forward, _native_backward)
+_NATIVE: Any = jax.custom_vjp(_native, nondiff_argnums=(0,))
+_NATIVE.defvjp(_native_forward, _native_backward)
 
 
-def _call(name: str, shape: Any, *arguments: Array, stride: int) -> Any:
-    """Calls a function of convolution.c that returns arrays of these shapes."""
-    results = jax.tree.map(
-        lambda s: jax.ShapeDtypeStruct(s, jnp.float32),
-        shape,
-        is_leaf=lambda s: all(isinstance(n, int) for n in s),
-    )
+def _array(*shape: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(shape, jnp.float32)
+
+
+def _call(name: str, results: Any, stride: int, *arguments: Array) -> Any:
+    """Calls a function of convolution.c."""
     call = jax.ffi.ffi_call(name, results, vmap_method="sequential")
     return call(*arguments, stride=np.int64(stride))

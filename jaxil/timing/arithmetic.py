@@ -15,21 +15,22 @@ def count(bench: Bench, update_ms: float) -> dict[str, Any]:
     can miss what it hands to other libraries, and has work that is no product.
 
     Args:
-      bench: whose update is compiled once more, from the cache as a rule.
+      bench: whose update is compiled once more, from the cache as a rule, and once
+        with XLA's convolutions.
       update_ms: measured.
 
     Returns:
       Operations in GFLOP, memory in MB; None where XLA or `flops` can't tell.
     """
-    program = bench.lower_update().compile()
-    by_xla = (program.cost_analysis() or {}).get("flops")
+    plain = bench.lower_plain_update().compile()
+    by_xla = (plain.cost_analysis() or {}).get("flops")
     by_hand = by_part(
         bench.run.config, bench.episode.frames.shape[1:], bench.episode.actions.shape[1]
     )
     total = None if by_hand is None else sum(by_hand.values())
     chosen = by_xla if total is None else total
     peak = device.peak_flops_per_second()
-    memory = program.memory_analysis()
+    memory = bench.lower_update().compile().memory_analysis()
     results: dict[str, Any] = {
         "update_gflop": None if by_xla is None else by_xla / 1e9,
         "update_gflop_by_hand": None if total is None else total / 1e9,

@@ -119,11 +119,23 @@ class Bench:
 
     def lower_update(self) -> Any:
         """Traces one update anew, for the compiler."""
+        return self._lower(self.run.agent.update_step)
+
+    def lower_plain_update(self) -> Any:
+        """Traces one update with XLA's convolutions, whose operations XLA can count."""
+        run = self.run
+        config = run.config.copy_and_resolve_references()
+        with config.unlocked():
+            config.encoder.convolutions = "xla"
+        agent = experiment.make_agent(config, run.environment, run.demonstrations)
+        return self._lower(agent.update_step)
+
+    def _lower(self, step: Any) -> Any:
         shapes = jax.tree.map(
             lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype),
             (self.run.state, *self.batches, self.run.updates.frames()),
         )
-        return self.run.agent.update_step.lower(*shapes)  # pyright: ignore
+        return step.lower(*shapes)
 
     def play_evaluation(self) -> None:
         """Plays one episode as an evaluation does, without its video."""

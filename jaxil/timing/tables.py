@@ -50,7 +50,7 @@ ROWS: dict[str, dict[str, str]] = {
         "peak_device_memory_gb": "of the accelerator",
     },
     "arithmetic of one update": {
-        "update_gflop": "by XLA's count of the compiled program",
+        "update_gflop": "by XLA's count, with its own convolutions",
         "update_gflop_by_hand": "matrix products and convolutions, counted by hand",
         "encoder_share_percent": "the encoder's share of those",
         "matrix_product_gflops": "a second: this device's best float32 product",

@@ -10,6 +10,7 @@ import numpy as np
 import optax
 import pytest
 
+from jaxil import native
 from jaxil.learner.update import Learner, init_train_state, make_update_step
 from jaxil.maths.types import Batch, Episode, ExpertBatch, ExpertEpisodes, Window
 from jaxil.networks.agent import apply, critic_features
@@ -528,23 +529,29 @@ def test_rejects_a_column_of_rewards():
         make_update_step(learner)(make_state(learner), batch, None)
 
 
-def test_images_encoded_in_chunks_learn_the_same_over_50_updates():
+@pytest.mark.parametrize("way", [{"chunk_size": 3}, {"native": True}])
+def test_every_way_to_encode_learns_the_same_over_50_updates(way):
     # Sums are taken in another order, so rounding differs, and Adam magnifies what
     # differs in small gradients; 50 updates of 3e-3 keep it below 1e-4.
-    networks = NETWORKS._replace(encoder=NETWORKS.encoder.clone(chunk_size=3))
-    plain, chunked = make_learner(), make_learner(networks=networks)
-    states = [make_state(plain), make_state(plain)]
+    assert native.problem() is None
+    encoder = NETWORKS.encoder.clone(channels=(32, 32))
+    networks = [NETWORKS._replace(encoder=encoder.clone(**w)) for w in ({}, way)]
+    learners = [make_learner(networks=each) for each in networks]
+    states = [make_state(learner) for learner in learners]
+    program = jax.make_jaxpr(make_update_step(learners[1]))
+    uses_ours = "jaxil_convolve_relu" in str(program(states[1], make_batch(0), None))
+    assert uses_ours == ("native" in way)
     for number in range(50):
         batch = make_batch(number)
         states = [
             jitted(learner)(state, batch, None)[0]
-            for learner, state in zip((plain, chunked), states)
+            for learner, state in zip(learners, states)
         ]
     chex.assert_trees_all_close(
         states[0].params, states[1].params, rtol=1e-3, atol=1e-4
     )
     # Not for want of learning: what was learned is far larger than the tolerance.
-    start = make_state(plain).params
+    start = make_state(learners[0]).params
     moved = jax.tree.map(
         lambda a, b: float(jnp.max(jnp.abs(a - b))),
         start.encoder,

@@ -205,23 +205,6 @@ class EncodeTest(chex.TestCase):
         assert "f32[2,7,7,4]" in program
         assert "f32[8,7,7,4]" not in program
 
-    def test_chunks_need_less_memory_between(self):
-        # Copies of all layers of all chunks would be as large as the layers are.
-        def temporaries(chunk_size):
-            encoder = PixelEncoder(
-                (8, 8, 8), (3, 3, 3), (1, 1, 1), chunk_size=chunk_size
-            )
-            images = random_images((16, 32, 32, 3))
-            params = encoder.init(jax.random.key(0), images)
-            gradient = jax.grad(
-                lambda p: jnp.sum(jnp.square(encode(encoder, p, images)))
-            )
-            memory = jax.jit(gradient).lower(params).compile().memory_analysis()
-            assert memory is not None
-            return memory.temp_size_in_bytes
-
-        assert temporaries(2) < 0.8 * temporaries(0)
-
     def test_states_are_encoded_as_they_come(self):
         states = jnp.arange(6.0).reshape(2, 3)
         encoder = StateEncoder(4)

@@ -1,0 +1,133 @@
+"""Compiling our own convolutions: once, by whom, and what is said if it can't be."""
+
+import os
+import shutil
+import stat
+
+import jax
+import pytest
+
+from jaxil import config as jaxil_config
+from jaxil import doctor, experiment, native
+
+
+@pytest.fixture(autouse=True)
+def _forgotten(monkeypatch):
+    """What this process knows about the library is asked anew."""
+    monkeypatch.setattr(native, "problem", native.problem.__wrapped__)
+
+
+@pytest.fixture
+def without_compiler(monkeypatch, tmp_path):
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path / "nothing"))
+    monkeypatch.setattr(
+        native.platform, "compilation_folder", lambda: tmp_path / "cache"
+    )
+
+
+def compiler_that(tmp_path, script):
+    path = tmp_path / "compiler"
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return str(path)
+
+
+def test_is_compiled_once_and_leaves_nothing_else(tmp_path):
+    folder = tmp_path / "not" / "yet"
+    path = native.build(folder)
+    when = path.stat().st_mtime_ns
+    assert native.build(folder) == path
+    assert path.stat().st_mtime_ns == when
+    assert os.listdir(folder) == [path.name]
+
+
+def test_other_flags_are_another_library(tmp_path):
+    assert native.build(tmp_path) != native.build(tmp_path, (*native.FLAGS, "-g"))
+    assert len(os.listdir(tmp_path)) == 2
+
+
+def test_the_users_compiler_is_taken_with_its_options(tmp_path, monkeypatch):
+    seen = tmp_path / "seen"
+    real = shutil.which("gcc")
+    script = f'echo "$1" > {seen}; shift; exec {real} "$@"'
+    monkeypatch.setenv("CC", compiler_that(tmp_path, script) + " --first")
+    assert native.build(tmp_path / "cache").exists()
+    assert seen.read_text() == "--first\n"
+
+
+@pytest.mark.usefixtures("without_compiler")
+def test_without_a_compiler_xlas_convolutions_are_used():
+    assert "apt-get install gcc" in (native.problem() or "")
+    config = jaxil_config.default_config()
+    assert not experiment.uses_native_convolutions(config)
+    networks = experiment.make_networks(config, 1, 0.5)
+    assert not networks.encoder.native
+    (finding,) = doctor.convolutions()
+    assert finding.level == "warning"
+    assert "apt-get install gcc" in finding.value
+
+
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [
+        ("echo 'convolution.c:1: error: no' >&2; exit 1", "convolution.c:1: error: no"),
+        ("exit 3", "no message"),
+        ("echo text > $6; exit 0", "convolution"),  # a file that is no library
+    ],
+)
+def test_a_compiler_that_fails_is_named(tmp_path, monkeypatch, script, said):
+    compiler = compiler_that(tmp_path, script)
+    monkeypatch.setenv("CC", compiler)
+    folder = tmp_path / "cache"
+    monkeypatch.setattr(native.platform, "compilation_folder", lambda: folder)
+    problem = native.problem()
+    assert problem is not None
+    assert said in problem
+    assert "\n" not in problem
+    assert not list(folder.glob("*.tmp"))
+
+
+def test_a_compiler_that_is_not_there_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", str(tmp_path / "missing"))
+    with pytest.raises(native.BuildError, match="missing"):
+        native.build(tmp_path)
+
+
+def test_it_is_for_cpus_only(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert "gpu" in (native.problem() or "")
+    assert list(doctor.convolutions()) == []
+
+
+def test_the_config_chooses():
+    config = jaxil_config.default_config()
+    assert experiment.uses_native_convolutions(config)
+    assert experiment.make_networks(config, 1, 0.5).encoder.native
+    (finding,) = doctor.convolutions()
+    assert finding.level == "ok"
+    for field, value in (("compute_dtype", "bfloat16"), ("observation", "state")):
+        other = config.copy_and_resolve_references()
+        other[field] = value
+        assert not experiment.uses_native_convolutions(other)
+    config.encoder.convolutions = "xla"
+    assert not experiment.uses_native_convolutions(config)
+
+
+@pytest.mark.usefixtures("without_compiler")
+def test_who_insists_is_told_before_anything_starts():
+    config = jaxil_config.default_config()
+    config.encoder.convolutions = "native"
+    (fault,) = experiment.problems(config)
+    assert "encoder.convolutions='native'" in fault
+    assert "apt-get install gcc" in fault
+    config.compute_dtype = "bfloat16"
+    (fault,) = experiment.problems(config)
+    assert "compute_dtype='bfloat16'" in fault
+
+
+def test_an_unknown_form_is_a_fault():
+    config = jaxil_config.default_config()
+    config.encoder.convolutions = "cuda"
+    (fault,) = experiment.problems(config)
+    assert "auto, native, xla" in fault
