@@ -43,7 +43,6 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     config.encoder.strides = (4, 1, 1)
     config.encoder.contrast = 4.0
     config.encoder.subtract_mean_image = True
-    config.encoder.chunk_size = 0  # a whole batch's layers fit into the caches
     config.shift_padding = 2
     config.hidden_dim = 256
     config.batch_size = 64

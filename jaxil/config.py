@@ -82,9 +82,6 @@ def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Conf
     config.encoder.strides = (2, 1, 1, 1)
     config.encoder.contrast = 1.0
     config.encoder.subtract_mean_image = False  # the demonstrations' mean, not 0.5
-    # On CPUs so many images are encoded at a time; see `networks.encoder.encode`. 0
-    # encodes a batch at once.
-    config.encoder.chunk_size = 8
     # On CPUs with a C compiler our own are used, in float32; "xla" never, "native" or
     # not at all; see `jaxil.native`.
     config.encoder.convolutions = "auto"
@@ -230,7 +227,6 @@ _RANGES: dict[str, tuple[float, float, str]] = {
     "shift_padding": (0, 512, "4 in the paper, 0 for no augmentation"),
     "pre_tanh_penalty": (0.0, 1e3, "0 in the paper"),
     "encoder.contrast": (1e-6, 1e6, "1 in the paper"),
-    "encoder.chunk_size": (0, 65_536, "8 suits most CPUs; 0 encodes batches whole"),
     "demonstrations.num_episodes": (1, 10**6, "1, 10 or 50 in the paper"),
     "demonstrations.frame_skip": (1, 10**4, "1 keeps every frame of a pixel file"),
     "sinkhorn.epsilon": (1e-6, 1e3, "0.01 in the reference"),

@@ -291,14 +291,8 @@ def make_networks(config: Config, action_dim: int, mean: Any) -> AgentNetworks:
         contrast=config.encoder.contrast,
         mean=mean,
         compute_dtype=config.compute_dtype,
-        chunk_size=chunk_size(config),
         native=uses_native_convolutions(config),
     )
-
-
-def chunk_size(config: Config) -> int:
-    """Returns how many images are encoded at a time: 0, all of them, but on CPUs."""
-    return config.encoder.chunk_size if jax.default_backend() == "cpu" else 0
 
 
 def uses_native_convolutions(config: Config) -> bool:

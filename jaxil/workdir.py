@@ -12,7 +12,9 @@ from jaxil.command import UsageError
 from jaxil.config import Config, default_config
 
 # A run may be prolonged, or be computed in another way, without becoming another run.
-_FREE_FIELDS = ("total_frames", "encoder.chunk_size", "encoder.convolutions")
+_FREE_FIELDS = ("total_frames", "encoder.convolutions")
+# Older runs have these, which said how something is computed and nothing else.
+_FORMER_FIELDS = (("encoder", "chunk_size"),)
 
 
 def problems(workdir: pathlib.Path, config: Config) -> list[str]:
@@ -76,7 +78,7 @@ def read_config(workdir: pathlib.Path) -> Config:
     """Returns the config of the run in a folder.
 
     Fields that did not exist when it was written have their defaults: these are what
-    was done before there was a choice.
+    was done before there was a choice. Those that exist no longer are left out.
 
     Raises:
       UsageError: there is none, or it can't be read.
@@ -85,6 +87,8 @@ def read_config(workdir: pathlib.Path) -> Config:
     try:
         stored = json.loads(path.read_text())["config"]
         config = default_config(stored["method"], stored["task"])
+        for section, field in _FORMER_FIELDS:
+            stored.get(section, {}).pop(field, None)
         config.update(stored)
         return config
     except OSError as error:
@@ -92,7 +96,7 @@ def read_config(workdir: pathlib.Path) -> Config:
             f"workdir={str(workdir)!r} holds no run: {path} can't be read "
             f"({error.strerror}); give the --workdir of a `jaxil.launch`"
         ) from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UsageError(
             f"{path} is damaged ({error}); restore it, or start in another folder"
         ) from error

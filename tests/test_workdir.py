@@ -25,15 +25,25 @@ def test_a_field_that_is_newer_than_the_run_has_its_default(tmp_path):
     assert "sinkhorn.alignment: 'transport' there, 'time' here" in fault
 
 
-def test_a_run_goes_on_longer_or_in_other_chunks(tmp_path):
-    # The presets' chunks differ: a run that is older than the field has the default's.
+def test_a_run_goes_on_longer_or_with_other_convolutions(tmp_path):
     config = jaxil_config.default_config("psil", "walker_walk")
-    old = config.to_dict()
-    del old["encoder"]["chunk_size"]
-    write(tmp_path, old)
-    config.encoder.chunk_size = 64
+    write(tmp_path, config.to_dict())
+    config.encoder.convolutions = "xla"
     config.total_frames *= 2
     assert workdir.problems(tmp_path, config) == []
+
+
+def test_a_run_goes_on_that_has_a_field_of_former_times(tmp_path):
+    config = jaxil_config.default_config("psil", "walker_walk")
+    old = config.to_dict()
+    old["encoder"]["chunk_size"] = 64
+    write(tmp_path, old)
+    assert workdir.problems(tmp_path, config) == []
+    assert "chunk_size" not in workdir.read_config(tmp_path).encoder
+    old["encoder"]["chunks"] = 64  # was never one
+    write(tmp_path, old)
+    (fault,) = workdir.problems(tmp_path, config)
+    assert "encoder.chunks: 64 there" in fault
 
 
 def test_what_was_written_is_read(tmp_path):

@@ -10,7 +10,6 @@ from jaxil.learner.update import Learner, UpdateStep
 from jaxil.maths import augmentation, losses
 from jaxil.maths.types import Batch, ExpertBatch, Metrics, Params
 from jaxil.networks.agent import apply
-from jaxil.networks.encoder import encode
 
 
 def make_cloning_step(learner: Learner, *, std: float) -> UpdateStep:
@@ -40,7 +39,7 @@ def make_cloning_step(learner: Learner, *, std: float) -> UpdateStep:
         encoder, actor, _ = learner.networks
 
         def loss(params: tuple[Params, Params]) -> tuple[Array, Array]:
-            representation = encode(encoder, params[0], observation)
+            representation = apply(encoder, params[0], observation)
             pre_tanh = apply(actor, params[1], representation)
             negative = losses.cloning_loss(jnp.tanh(pre_tanh), expert.action, std=std)
             penalty = losses.saturation_penalty(pre_tanh)

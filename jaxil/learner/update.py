@@ -19,7 +19,6 @@ from jaxil.learner.state import (
 from jaxil.maths import augmentation, distributions, losses
 from jaxil.maths.types import Batch, Data, ExpertBatch, Metrics, Params
 from jaxil.networks.agent import AgentNetworks, apply
-from jaxil.networks.encoder import encode
 from jaxil.rewarders.rewarder import AgentView, Rewarder, Spec
 
 UpdateStep = Callable[
@@ -168,7 +167,7 @@ def _update_critic(
     """
     encoder, actor, critic = learner.networks
     # There is no target encoder: next observations pass through the live one.
-    next_representation = encode(encoder, state.encoder.params, batch.next_observation)
+    next_representation = apply(encoder, state.encoder.params, batch.next_observation)
     next_mean = jnp.tanh(apply(actor, state.actor.params, next_representation))
     next_action = distributions.sample_truncated_normal(
         next_mean, std, key, noise_clip=learner.noise_clip
@@ -178,7 +177,7 @@ def _update_critic(
 
     def loss(params: tuple[Params, Params]) -> tuple[Array, tuple[Array, ...]]:
         encoder_params, critic_params = params
-        representation = encode(encoder, encoder_params, batch.observation)
+        representation = apply(encoder, encoder_params, batch.observation)
         features = apply(critic, critic_params, representation, method=critic.features)
         values = apply(
             critic, critic_params, features, batch.action, method=critic.values

@@ -8,7 +8,7 @@ from jax import Array
 from jaxil.maths.types import Params
 from jaxil.networks.actor import Actor
 from jaxil.networks.critic import Critic
-from jaxil.networks.encoder import PixelEncoder, StateEncoder, encode
+from jaxil.networks.encoder import PixelEncoder, StateEncoder
 
 
 class AgentNetworks(NamedTuple):
@@ -31,7 +31,6 @@ def make_agent_networks(
     contrast: float,
     mean: Any,
     compute_dtype: str = "float32",
-    chunk_size: int = 0,
     native: bool = False,
 ) -> AgentNetworks:
     """Returns the networks of DrQ-v2.
@@ -48,7 +47,6 @@ def make_agent_networks(
       mean: see `PixelEncoder`.
       compute_dtype: "float32" or "bfloat16", of the convolutions and of the product
         that follows them.
-      chunk_size: see `PixelEncoder`.
       native: see `PixelEncoder`.
     """
     dtype = jnp.dtype(compute_dtype)
@@ -62,7 +60,6 @@ def make_agent_networks(
             contrast,
             mean,
             dtype,
-            chunk_size,
             native,
         )
     return AgentNetworks(
@@ -84,7 +81,7 @@ def actor_features(
     observation: Array,
 ) -> Array:
     """Returns trunk features of the actor. [B, H, W, C] to [B, D]."""
-    representation = encode(networks.encoder, encoder_params, observation)
+    representation = apply(networks.encoder, encoder_params, observation)
     actor = networks.actor
     return apply(actor, actor_params, representation, method=actor.features)
 
@@ -96,6 +93,6 @@ def critic_features(
     observation: Array,
 ) -> Array:
     """Returns trunk features of the critic. [B, H, W, C] to [B, D]."""
-    representation = encode(networks.encoder, encoder_params, observation)
+    representation = apply(networks.encoder, encoder_params, observation)
     critic = networks.critic
     return apply(critic, critic_params, representation, method=critic.features)

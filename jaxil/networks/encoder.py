@@ -4,11 +4,9 @@ from typing import Any
 
 import chex
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxil.maths.types import Data, Params
 from jaxil.networks.layers import ConvolutionReLU, dense
 
 
@@ -25,7 +23,6 @@ class PixelEncoder(nn.Module):
       mean: what is subtracted, in [0, 1]: 0.5 in the paper, or an image
         [H, W, C] as nested tuples or an array.
       dtype: of the convolutions; parameters are float32 whatever it is.
-      chunk_size: images that `encode` takes at a time; 0 for all.
       native: see `convolution.convolve_relu`.
 
     Source: facebookresearch/drqv2, drqv2.py, `Encoder`.
@@ -37,7 +34,6 @@ class PixelEncoder(nn.Module):
     contrast: float = 1.0
     mean: Any = 0.5
     dtype: Any = jnp.float32
-    chunk_size: int = 0
     native: bool = False
 
     @nn.compact
@@ -77,37 +73,3 @@ class StateEncoder(nn.Module):
         chex.assert_rank(observation, 2)
         s = observation.astype(jnp.float32)
         return nn.relu(dense(self.hidden_dim)(jnp.sign(s) * jnp.log1p(jnp.abs(s))))
-
-
-def encode(
-    encoder: PixelEncoder | StateEncoder, params: Params, observation: Data
-) -> Array:
-    """Returns the representation of a batch, computed a few images at a time.
-
-    The layers of a whole batch are hundreds of megabytes, which a CPU writes to memory
-    and reads again at each step of theirs; those of a chunk stay in its caches. Value
-    and gradients are the same up to the order of summation.
-
-    Args:
-      encoder: with its `chunk_size`; 0 computes the whole batch at once.
-      params: of the encoder.
-      observation: [B, H, W, C], or [B, S].
-
-    Returns:
-      Shape [B, R].
-    """
-
-    def whole(observation: Array) -> Array:
-        representation = encoder.apply(params, observation)
-        assert isinstance(representation, jax.Array)
-        return representation
-
-    observation = jnp.asarray(observation)
-    batch = observation.shape[0]
-    chunk = encoder.chunk_size if isinstance(encoder, PixelEncoder) else 0
-    if not 0 < chunk < batch:
-        return whole(observation)
-    # Not a loop: XLA would copy what its gradient needs into and out of arrays of all
-    # chunks, and finds nothing to do for a second core between two of them.
-    chunks = jnp.split(observation, list(range(chunk, batch, chunk)))
-    return jnp.concatenate([whole(images) for images in chunks])

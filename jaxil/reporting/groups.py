@@ -17,8 +17,8 @@ _FREE_FIELDS = (
     "total_frames",
     "checkpoint_every_frames",
     "video_every_evals",
-    "encoder.chunk_size",
     "encoder.convolutions",
+    "encoder.chunk_size",  # of older runs
 )
 # The name of the variant, or of the panel, says these already.
 _NAMED_FIELDS = (

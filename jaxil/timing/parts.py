@@ -16,7 +16,6 @@ from jaxil.learner.state import TrainState, apply_gradients
 from jaxil.maths import augmentation, distributions, losses
 from jaxil.maths.types import Batch, Data, ExpertBatch, Params
 from jaxil.networks.agent import AgentNetworks, apply
-from jaxil.networks.encoder import encode
 from jaxil.rewarders.rewarder import AgentView, Rewarder
 
 _STD = 0.1  # of exploration; its value costs nothing
@@ -61,7 +60,7 @@ def make_parts(
         return augmentation.augment(observation, key, padding=shift_padding)
 
     def see(params: Params, observation: Data) -> Array:
-        return encode(encoder, params, augment(observation))
+        return apply(encoder, params, augment(observation))
 
     def explore(params: Params, representation: Array) -> Array:
         mean = jnp.tanh(apply(actor, params, representation))

@@ -1,8 +1,10 @@
 """The encoder at the paper's size, and its arithmetic on tiny images."""
 
+import math
 from typing import Any
 
 import chex
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,8 +12,9 @@ import pytest
 from absl.testing import parameterized
 from jax import lax
 
+from jaxil import native
 from jaxil.networks.agent import apply
-from jaxil.networks.encoder import PixelEncoder, StateEncoder, encode
+from jaxil.networks.encoder import PixelEncoder, StateEncoder
 from jaxil.networks.layers import Trunk
 
 with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
@@ -164,51 +167,44 @@ def test_bfloat16_computes_in_halves_and_keeps_float32():
         assert np.abs(ours - theirs).max() < 0.05 * np.abs(theirs).max()
 
 
-class EncodeTest(chex.TestCase):
+class NativeTest(chex.TestCase):
     @with_and_without_jit
-    @parameterized.parameters(
-        (8, 2),  # four chunks
-        (7, 2),  # three, and one image left over
-        (5, 4),  # one, and one image left over
-        (4, 4),  # one: the batch is whole
-        (3, 8),  # less than one
-        (5, 0),  # XLA's own form
-    )
-    def test_chunks_change_neither_value_nor_gradients(self, batch, chunk):
-        plain = PixelEncoder((4, 5), (3, 3), (2, 1))
-        chunked = plain.clone(chunk_size=chunk)
-        images = random_images((batch, 12, 12, 3))
+    def test_native_convolutions_change_neither_value_nor_gradients(self):
+        assert native.problem() is None
+        plain = PixelEncoder((32, 64), (3, 3), (2, 1))
+        images = random_images((5, 12, 12, 3))
         params = plain.init(jax.random.key(0), images)
-        cotangent = jnp.sin(jnp.arange(batch * 45.0)).reshape(batch, 45)
+        cotangent = jnp.sin(jnp.arange(5 * 576.0)).reshape(5, 576)
 
-        def both(params):
+        def both(encoder, params):
             def weighted(params):
-                representation = encode(chunked, params, images)
+                representation = apply(encoder, params, images)
                 return jnp.sum(representation * cotangent), representation
 
             return jax.grad(weighted, has_aux=True)(params)
 
-        run: Any = self.variant(both)
-        gradients, value = run(params)
-        expected, transpose = jax.vjp(lambda p: plain.apply(p, images), params)
-        np.testing.assert_allclose(value, expected, rtol=1e-5, atol=1e-5)
+        run: Any = self.variant(lambda p: both(plain.clone(native=True), p))
         chex.assert_trees_all_close(
-            gradients, transpose(cotangent)[0], rtol=1e-4, atol=1e-4
+            run(params), both(plain, params), rtol=1e-4, atol=1e-4
         )
 
-    def test_a_chunk_at_a_time_is_computed(self):
-        # No array of the layers of a whole batch is in the program.
-        encoder = PixelEncoder((4,), (3,), (1,), chunk_size=2)
-        images = random_images((8, 9, 9, 3))
-        params = encoder.init(jax.random.key(0), images)
-        program = str(jax.make_jaxpr(lambda p: encode(encoder, p, images))(params))
-        assert "f32[2,7,7,4]" in program
-        assert "f32[8,7,7,4]" not in program
 
-    def test_states_are_encoded_as_they_come(self):
-        states = jnp.arange(6.0).reshape(2, 3)
-        encoder = StateEncoder(4)
-        params = encoder.init(jax.random.key(0), states)
-        np.testing.assert_array_equal(
-            encode(encoder, params, states), apply(encoder, params, states)
-        )
+def test_parameters_are_those_of_flaxs_convolutions():
+    # Checkpoints and seeds of runs from before there was a layer of our own go on.
+    class Flaxs(nn.Module):
+        @nn.compact
+        def __call__(self, x):
+            for features, stride in ((4, 2), (5, 1)):
+                x = nn.Conv(
+                    features,
+                    (3, 3),
+                    (stride, stride),
+                    "VALID",
+                    kernel_init=nn.initializers.orthogonal(scale=math.sqrt(2.0)),
+                )(x)
+            return x
+
+    encoder = PixelEncoder((4, 5), (3, 3), (2, 1))
+    ours = encoder.init(jax.random.key(3), random_images())
+    theirs = Flaxs().init(jax.random.key(3), jnp.zeros((2, 12, 12, 3)))
+    chex.assert_trees_all_equal(ours, theirs)
