@@ -50,6 +50,7 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     config.learning_rate = 3e-4
     config.pre_tanh_penalty = 2e-3
     config.replay_size_steps = 50_000
+    config.replay_on_device = True  # on a CPU too: XLA stacks faster than NumPy
     config.exploration_std_steps = 50_000
     config.discriminator.hidden_dim = 256
     config.discriminator.batch_size = _DISCRIMINATOR_BATCHES.get(method, 64)

@@ -116,9 +116,9 @@ def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Conf
         per_update = config.update_every_steps * config.action_repeat
         config.total_frames = _CLONING_UPDATES * per_update
 
-    # Speed, on a GPU. A copy of the replay's frames lies on the device and batches send
-    # only their places there; the samples are the same, and the ring in the host's
-    # memory stays what checkpoints save.
+    # Speed, on a GPU above all. A copy of the replay's frames lies on the device and
+    # batches send only their places there; the samples are the same, and the ring in
+    # the host's memory stays what checkpoints save.
     config.replay_on_device = False
     # So many updates are sent to the device at once: less waiting, but the policy that
     # acts lags by that less one. Episode ends, evaluations and checkpoints see all.

@@ -12,7 +12,7 @@ from jaxil.command import UsageError
 from jaxil.config import Config, default_config
 
 # A run may be prolonged, or be computed in another way, without becoming another run.
-_FREE_FIELDS = ("total_frames", "encoder.convolutions")
+_FREE_FIELDS = ("total_frames", "encoder.convolutions", "replay_on_device")
 # Older runs have these, which said how something is computed and nothing else.
 _FORMER_FIELDS = (("encoder", "chunk_size"),)
 

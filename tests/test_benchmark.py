@@ -33,6 +33,7 @@ def measured(tmp_path_factory):
         "benchmark",
         _CONFIG,
         *SMALL,
+        "--config.replay_on_device=False",  # so that batches are pixels
         "--repeats=2",
         "--steps=20",
         f"--json={folder / 'new.json'}",

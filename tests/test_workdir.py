@@ -29,6 +29,7 @@ def test_a_run_goes_on_longer_or_with_other_convolutions(tmp_path):
     config = jaxil_config.default_config("psil", "walker_walk")
     write(tmp_path, config.to_dict())
     config.encoder.convolutions = "xla"
+    config.replay_on_device = True
     config.total_frames *= 2
     assert workdir.problems(tmp_path, config) == []
 

@@ -18,6 +18,7 @@ _FREE_FIELDS = (
     "checkpoint_every_frames",
     "video_every_evals",
     "encoder.convolutions",
+    "replay_on_device",
     "encoder.chunk_size",  # of older runs
 )
 # The name of the variant, or of the panel, says these already.

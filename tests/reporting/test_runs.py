@@ -163,7 +163,8 @@ def test_only_settings_that_matter_split_a_group(tmp_path):
     pdac = [
         read("a", "pdac"),
         read("b", "pdac", sinkhorn__epsilon=0.5, video_every_evals=0),
-        read("speed", "pdac", encoder__chunk_size=0),
+        read("speed", "pdac", encoder__convolutions="xla", replay_on_device=True),
+        read("old", "pdac", encoder__chunk_size=0),
     ]
     assert len(groups.make_groups(pdac)) == 1
     pdac.append(read("c", "pdac", discriminator__gradient_penalty=1.0))
