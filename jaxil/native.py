@@ -12,6 +12,7 @@ import os
 import pathlib
 import shutil
 import subprocess
+import tempfile
 
 import jax
 
@@ -69,26 +70,26 @@ def build(folder: pathlib.Path, flags: tuple[str, ...] = FLAGS) -> pathlib.Path:
     compiler = os.environ.get("CC") or next(filter(shutil.which, _COMPILERS), None)
     if compiler is None:
         raise BuildError("there is no C compiler: `apt-get install gcc` brings one")
-    temporary = folder / f"{path.name}.{os.getpid()}.tmp"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        done = subprocess.run(
-            [*compiler.split(), *flags, f"-I{_headers()}", "-o", temporary, _SOURCE],
-            capture_output=True,
-            text=True,
-            timeout=_SECONDS,
-        )
-        if done.returncode:
-            last = (done.stderr.strip() or "no message").splitlines()[-1]
-            raise BuildError(f"{compiler} can't compile {_SOURCE.name}: {last}")
-        os.replace(temporary, path)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise BuildError(f"{compiler} can't be run: {error}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder) as scratch:
+            output = pathlib.Path(scratch) / path.name
+            _compile(compiler, flags, output)
+            os.replace(output, path)
+    except OSError as error:
+        raise BuildError(f"{folder} can't be written: {error.strerror}") from error
     return path
 
 
-def _headers() -> pathlib.Path:
-    """Returns the folder of XLA's headers, which are part of jaxlib."""
-    return pathlib.Path(jax.ffi.include_dir())
+def _compile(compiler: str, flags: tuple[str, ...], output: pathlib.Path) -> None:
+    # XLA's headers are part of jaxlib.
+    words = [*compiler.split(), *flags, f"-I{jax.ffi.include_dir()}", _SOURCE]
+    try:
+        done = subprocess.run(
+            [*words, "-o", output], capture_output=True, text=True, timeout=_SECONDS
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise BuildError(f"{compiler} can't be run: {error}") from error
+    if done.returncode or not output.exists():
+        last = (done.stderr.strip() or "no message").splitlines()[-1]
+        raise BuildError(f"{compiler} can't compile {_SOURCE.name}: {last}")

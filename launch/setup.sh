@@ -50,6 +50,7 @@ set_up() { # EXTRAS
     clear_venv
   fi
   install_system_packages
+  install_compiler
   is_ready "$1" || install_project "$1"
   trap - INT TERM HUP
   exec {lock}>&-
@@ -106,6 +107,13 @@ install_system_packages() {
   find_python
   [[ -n $python ]] || fail 2 "${packages[0]} brought no usable Python:" \
     "name one that has venv and ensurepip with PYTHON=PATH."
+}
+
+# For convolutions (`jaxil/native.py`). Without one all works, more slowly: it is not
+# worth a password, nor a failure.
+install_compiler() {
+  [[ -z ${CC:-}$(type -P gcc cc clang) && $EUID == 0 ]] || return 0
+  (apt_install gcc libc6-dev) || say "Going on without a C compiler."
 }
 
 # Sets python; where it finds none, sets the caller's version to that of a Python which

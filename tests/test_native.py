@@ -73,7 +73,8 @@ def test_without_a_compiler_xlas_convolutions_are_used():
     [
         ("echo 'convolution.c:1: error: no' >&2; exit 1", "convolution.c:1: error: no"),
         ("exit 3", "no message"),
-        ("echo text > $6; exit 0", "convolution"),  # a file that is no library
+        ("echo text > $9; exit 0", "too short"),  # a file that is no library
+        ("exit 0", "no message"),
     ],
 )
 def test_a_compiler_that_fails_is_named(tmp_path, monkeypatch, script, said):
@@ -85,13 +86,19 @@ def test_a_compiler_that_fails_is_named(tmp_path, monkeypatch, script, said):
     assert problem is not None
     assert said in problem
     assert "\n" not in problem
-    assert not list(folder.glob("*.tmp"))
+    assert len(list(folder.iterdir())) == said.count("short")
 
 
 def test_a_compiler_that_is_not_there_is_named(tmp_path, monkeypatch):
     monkeypatch.setenv("CC", str(tmp_path / "missing"))
     with pytest.raises(native.BuildError, match="missing"):
         native.build(tmp_path)
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(native.BuildError, match="file/cache can't be written"):
+        native.build(tmp_path / "file" / "cache")
 
 
 def test_it_is_for_cpus_only(monkeypatch):

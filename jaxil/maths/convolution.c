@@ -168,9 +168,12 @@ typedef struct {
   Work *work;
   Call *call;
   size_t count;
-  atomic_size_t next, done;
-  atomic_int users;
+  atomic_size_t next, done, users;
 } Team;
+
+static void leave(Team *team) {
+  if (atomic_fetch_sub(&team->users, 1) == 1) free(team);
+}
 
 static void take_part(void *data) {
   Team *team = data;
@@ -179,40 +182,55 @@ static void take_part(void *data) {
     team->work(team->call, image);
     atomic_fetch_add(&team->done, 1);
   }
-  if (atomic_fetch_sub(&team->users, 1) == 1) free(team);
+  leave(team);
+}
+
+static int succeeded(XLA_FFI_CallFrame *frame, XLA_FFI_Error *error) {
+  if (error == NULL) return 1;
+  XLA_FFI_Error_Destroy_Args args = {
+      .struct_size = XLA_FFI_Error_Destroy_Args_STRUCT_SIZE,
+      .error = error,
+  };
+  frame->api->XLA_FFI_Error_Destroy(&args);
+  return 0;
+}
+
+/* Returns how many threads XLA has; 1 where it doesn't tell. */
+static size_t number_of_threads(XLA_FFI_CallFrame *frame) {
+  int64_t threads = 1;
+  XLA_FFI_ThreadPool_NumThreads_Args args = {
+      .struct_size = XLA_FFI_ThreadPool_NumThreads_Args_STRUCT_SIZE,
+      .ctx = frame->ctx,
+      .num_threads = &threads,
+  };
+  const int known = succeeded(frame, frame->api->XLA_FFI_ThreadPool_NumThreads(&args));
+  return known && threads > 1 ? (size_t)threads : 1;
 }
 
 /* Works on all images, with the threads of XLA that are free. A thread that comes too
    late finds none left; so only images in work are waited for, and that always ends. */
 static void for_each_image(XLA_FFI_CallFrame *frame, Work *work, Call *call) {
-  const size_t count = call->shape.batch;
-  XLA_FFI_ThreadPool_NumThreads_Args pool = {
-      .struct_size = XLA_FFI_ThreadPool_NumThreads_Args_STRUCT_SIZE,
-      .ctx = frame->ctx,
-  };
-  int64_t threads = 0;
-  pool.num_threads = &threads;
-  XLA_FFI_Error *error = frame->api->XLA_FFI_ThreadPool_NumThreads(&pool);
-  Team *team = error == NULL && threads > 1 && count > 1 ? malloc(sizeof(Team)) : NULL;
+  const size_t count = call->shape.batch, threads = number_of_threads(frame);
+  const size_t members = threads < count ? threads : count;
+  Team *team = members > 1 ? malloc(sizeof(Team)) : NULL;
   if (team == NULL) {
     for (size_t image = 0; image < count; image++) work(call, image);
     return;
   }
-  const int helpers = (int)((size_t)threads < count ? (size_t)threads : count) - 1;
   *team = (Team){.work = work, .call = call, .count = count};
-  atomic_init(&team->users, helpers + 2);
-  for (int k = 0; k < helpers; k++) {
+  atomic_init(&team->users, members + 1); /* once more, for the one who waits */
+  for (size_t k = 1; k < members; k++) {
     XLA_FFI_ThreadPool_Schedule_Args task = {
         .struct_size = XLA_FFI_ThreadPool_Schedule_Args_STRUCT_SIZE,
         .ctx = frame->ctx,
         .task = take_part,
         .data = team,
     };
-    frame->api->XLA_FFI_ThreadPool_Schedule(&task);
+    if (!succeeded(frame, frame->api->XLA_FFI_ThreadPool_Schedule(&task))) leave(team);
   }
   take_part(team);
   while (atomic_load(&team->done) < count) sched_yield();
-  if (atomic_fetch_sub(&team->users, 1) == 1) free(team);
+  leave(team);
 }
 
 static XLA_FFI_Error *no_memory(XLA_FFI_CallFrame *frame) {
