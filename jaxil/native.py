@@ -20,7 +20,7 @@ from jaxil import platform
 
 _SOURCE = pathlib.Path(__file__).parent / "maths" / "convolution.c"
 _FUNCTIONS = ("jaxil_convolve_relu", "jaxil_kernel_gradient", "jaxil_image_gradient")
-_COMPILERS = ("gcc", "cc", "clang")
+_COMPILERS = ("gcc", "cc")
 FLAGS = ("-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared")
 _SECONDS = 60.0  # it takes 1
 
@@ -69,7 +69,7 @@ def build(folder: pathlib.Path, flags: tuple[str, ...] = FLAGS) -> pathlib.Path:
         return path
     compiler = os.environ.get("CC") or next(filter(shutil.which, _COMPILERS), None)
     if compiler is None:
-        raise BuildError("there is no C compiler: `apt-get install gcc` brings one")
+        raise BuildError("there is no GCC: `apt-get install gcc libc6-dev` brings it")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
@@ -91,5 +91,6 @@ def _compile(compiler: str, flags: tuple[str, ...], output: pathlib.Path) -> Non
     except (OSError, subprocess.TimeoutExpired) as error:
         raise BuildError(f"{compiler} can't be run: {error}") from error
     if done.returncode or not output.exists():
-        last = (done.stderr.strip() or "no message").splitlines()[-1]
-        raise BuildError(f"{compiler} can't compile {_SOURCE.name}: {last}")
+        lines = (done.stderr.strip() or "no message").splitlines()
+        said = next((line for line in lines if "error:" in line), lines[-1])
+        raise BuildError(f"{compiler} can't compile {_SOURCE.name}: {said}")

@@ -112,8 +112,8 @@ install_system_packages() {
 # For convolutions (`jaxil/native.py`). Without one all works, more slowly: it is not
 # worth a password, nor a failure.
 install_compiler() {
-  [[ -z ${CC:-}$(type -P gcc cc clang) && $EUID == 0 ]] || return 0
-  (apt_install gcc libc6-dev) || say "Going on without a C compiler."
+  [[ -z ${CC:-}$(type -P gcc) && $EUID == 0 ]] || return 0
+  (apt_install gcc libc6-dev) || say "Going on without GCC."
 }
 
 # Sets python; where it finds none, sets the caller's version to that of a Python which

@@ -58,14 +58,14 @@ def test_the_users_compiler_is_taken_with_its_options(tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("without_compiler")
 def test_without_a_compiler_xlas_convolutions_are_used():
-    assert "apt-get install gcc" in (native.problem() or "")
+    assert "apt-get install gcc libc6-dev" in (native.problem() or "")
     config = jaxil_config.default_config()
     assert not experiment.uses_native_convolutions(config)
     networks = experiment.make_networks(config, 1, 0.5)
     assert not networks.encoder.native
     (finding,) = doctor.convolutions()
     assert finding.level == "warning"
-    assert "apt-get install gcc" in finding.value
+    assert "apt-get install gcc libc6-dev" in finding.value
 
 
 @pytest.mark.parametrize(
@@ -93,6 +93,12 @@ def test_a_compiler_that_is_not_there_is_named(tmp_path, monkeypatch):
     monkeypatch.setenv("CC", str(tmp_path / "missing"))
     with pytest.raises(native.BuildError, match="missing"):
         native.build(tmp_path)
+
+
+def test_an_older_processor_is_named(tmp_path):
+    flags = [flag for flag in native.FLAGS if not flag.startswith("-march")]
+    with pytest.raises(native.BuildError, match="processors with AVX2 and FMA"):
+        native.build(tmp_path, (*flags, "-march=x86-64"))
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
@@ -127,7 +133,7 @@ def test_who_insists_is_told_before_anything_starts():
     config.encoder.convolutions = "native"
     (fault,) = experiment.problems(config)
     assert "encoder.convolutions='native'" in fault
-    assert "apt-get install gcc" in fault
+    assert "apt-get install gcc libc6-dev" in fault
     config.compute_dtype = "bfloat16"
     (fault,) = experiment.problems(config)
     assert "compute_dtype='bfloat16'" in fault

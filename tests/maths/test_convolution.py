@@ -292,10 +292,9 @@ print("equal")
 """
 
 
-@pytest.mark.parametrize("kind", ["x86-64", "x86-64-v3", "x86-64-v4"])
-def test_processors_with_shorter_vectors_compute_the_same(kind, tmp_path):
+@pytest.mark.parametrize("kind", ["x86-64-v3", "x86-64-v4"])
+def test_vectors_of_either_length_compute_the_same(kind, tmp_path):
     flags = pathlib.Path("/proc/cpuinfo").read_text()
-    needed = {"x86-64": " sse2 ", "x86-64-v3": " avx2 ", "x86-64-v4": " avx512vl "}
-    if needed[kind] not in flags:
+    if {"x86-64-v3": " avx2 ", "x86-64-v4": " avx512vl "}[kind] not in flags:
         pytest.skip(f"this processor is no {kind}")
     assert run_alone(OTHER_PROCESSOR, str(tmp_path), f"-march={kind}") == "equal\n"
