@@ -88,8 +88,10 @@ def _compile(compiler: str, flags: tuple[str, ...], output: pathlib.Path) -> Non
         done = subprocess.run(
             [*words, "-o", output], capture_output=True, text=True, timeout=_SECONDS
         )
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise BuildError(f"{compiler} can't be run: {error}") from error
+    except subprocess.TimeoutExpired as error:
+        raise BuildError(f"{compiler} takes more than {_SECONDS:.0f} s") from error
+    except OSError as error:
+        raise BuildError(f"{compiler} can't be run: {error.strerror}") from error
     if done.returncode or not output.exists():
         lines = (done.stderr.strip() or "no message").splitlines()
         said = next((line for line in lines if "error:" in line), lines[-1])

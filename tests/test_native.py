@@ -101,6 +101,13 @@ def test_an_older_processor_is_named(tmp_path):
         native.build(tmp_path, (*flags, "-march=x86-64"))
 
 
+def test_a_compiler_that_hangs_is_given_up(tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", compiler_that(tmp_path, "exec sleep 60"))
+    monkeypatch.setattr(native, "_SECONDS", 1.0)
+    with pytest.raises(native.BuildError, match="takes more than 1 s"):
+        native.build(tmp_path / "cache")
+
+
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(native.BuildError, match="file/cache can't be written"):
