@@ -16,16 +16,19 @@ _HERE = pathlib.Path(__file__).parent
 _COLOURS = {"pdac": "#1f6f8b", "psil": "#c8553d", "drqv2": "#588157", "zero": "#777777"}
 _STYLES = {2: "-", 4: "--", 8: "-."}  # by action repeat
 _PENALTY = 10.0  # the discriminator's, in the paper
+# In the names of runs that only the code tells apart, which was older or newer.
+_SAME_SETTINGS = ("again", "native")
 _COLUMNS = 2
 _NAMES = {"pdac": "P-DAC", "psil": "P-SIL", "drqv2": "true reward", "zero": "no reward"}
 
 
 def main() -> None:
     """Draws one panel for each task, one line for each run."""
-    runs: dict[str, list[tuple[dict, dict]]] = {}
+    runs: dict[str, list[tuple[str, dict, dict]]] = {}
     for path in sorted(_HERE.glob("*/eval.csv")):
         config = json.loads((path.parent / "config.json").read_text())["config"]
-        runs.setdefault(config["task"], []).append((config, read_csv(path)))
+        run = (path.parent.name, config, read_csv(path))
+        runs.setdefault(config["task"], []).append(run)
     rows = -(-len(runs) // _COLUMNS)
     size = (5.2 * _COLUMNS, 5.2 * rows)
     figure = Figure(figsize=size, dpi=120, layout="constrained")
@@ -34,11 +37,11 @@ def main() -> None:
     for axes in panels[len(runs) :]:
         axes.set_axis_off()
     for axes, (task, task_runs) in zip(panels, sorted(runs.items()), strict=False):
-        experts = [table["expert_task_return_mean"][-1] for _, table in task_runs]
+        experts = [table["expert_task_return_mean"][-1] for *_, table in task_runs]
         expert = max(experts)
         axes.axhline(expert, color="#444444", ls="--", lw=1.2, label="expert")
         axes.axhline(0.8 * expert, color="#444444", ls=":", lw=1.0, label="80 % of it")
-        for config, table in task_runs:
+        for name, config, table in task_runs:
             axes.plot(
                 table["frame"],
                 table["task_return_mean"],
@@ -51,7 +54,7 @@ def main() -> None:
                 lw=1.8 if max(table["task_return_mean"]) >= 0.8 * expert else 0.8,
                 marker="o",
                 ms=2.5,
-                label=_label(config),
+                label=_label(name, config),
             )
         axes.set_title(task, loc="left", fontsize=11)
         axes.set_xlim(left=0)
@@ -71,7 +74,7 @@ def main() -> None:
     figure.savefig(_HERE / "learning.png")
 
 
-def _label(config: dict) -> str:
+def _label(name: str, config: dict) -> str:
     parts = [
         _NAMES[config["method"]],
         f"repeat {config['action_repeat']}",
@@ -85,6 +88,7 @@ def _label(config: dict) -> str:
     penalty = config["discriminator"]["gradient_penalty"]
     if penalty != _PENALTY:
         parts.append(f"penalty {penalty:g}")
+    parts += [word for word in _SAME_SETTINGS if word in name.split("_")]
     return ", ".join(parts)
 
 
