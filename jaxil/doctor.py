@@ -180,7 +180,7 @@ def convolutions() -> Iterator[Finding]:
         yield Finding("ok", "convolutions", "our own, compiled for this processor")
     else:
         advice = (
-            "XLA's are used: an update at the paper's sizes takes 1.4 times as long"
+            "XLA's are used: an update at the paper's sizes takes 1.7 times as long"
         )
         yield Finding("warning", "convolutions", problem, advice)
 

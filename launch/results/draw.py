@@ -17,18 +17,18 @@ _COLOURS = {"pdac": "#1f6f8b", "psil": "#c8553d", "drqv2": "#588157", "zero": "#
 _STYLES = {2: "-", 4: "--", 8: "-."}  # by action repeat
 _PENALTY = 10.0  # the discriminator's, in the paper
 # In the names of runs that only the code tells apart, which was older or newer.
-_SAME_SETTINGS = ("again", "native")
+_SAME_SETTINGS = {"again": "-.", "native": "-"}
 _COLUMNS = 2
 _NAMES = {"pdac": "P-DAC", "psil": "P-SIL", "drqv2": "true reward", "zero": "no reward"}
 
 
 def main() -> None:
-    """Draws one panel for each task, one line for each run."""
+    """Draws a panel or two for each task, one line for each run."""
     runs: dict[str, list[tuple[str, dict, dict]]] = {}
     for path in sorted(_HERE.glob("*/eval.csv")):
         config = json.loads((path.parent / "config.json").read_text())["config"]
         run = (path.parent.name, config, read_csv(path))
-        runs.setdefault(config["task"], []).append(run)
+        runs.setdefault(_panel(config), []).append(run)
     rows = -(-len(runs) // _COLUMNS)
     size = (5.2 * _COLUMNS, 5.2 * rows)
     figure = Figure(figsize=size, dpi=120, layout="constrained")
@@ -47,9 +47,7 @@ def main() -> None:
                 table["task_return_mean"],
                 color=_COLOURS[config["method"]],
                 alpha=1.0 if config["seed"] == 0 else 0.55,
-                ls=":"
-                if config["observation"] == "state"
-                else _STYLES[config["action_repeat"]],
+                ls=_style(name, config),
                 # Runs that got nowhere stay in the background.
                 lw=1.8 if max(table["task_return_mean"]) >= 0.8 * expert else 0.8,
                 marker="o",
@@ -72,6 +70,23 @@ def main() -> None:
         )
     panels[0].set_ylabel("task return, mean of 10 episodes")
     figure.savefig(_HERE / "learning.png")
+
+
+def _panel(config: dict) -> str:
+    penalty = config["discriminator"]["gradient_penalty"]
+    is_preset = penalty != _PENALTY and config["observation"] == "pixels"
+    if config["task"] == "cartpole_swingup" and is_preset:
+        return "cartpole_swingup, P-DAC's preset"
+    return config["task"]
+
+
+def _style(name: str, config: dict) -> str:
+    if config["observation"] == "state":
+        return ":"
+    for word, style in _SAME_SETTINGS.items():
+        if word in name.split("_"):
+            return style
+    return _STYLES[config["action_repeat"]]
 
 
 def _label(name: str, config: dict) -> str:
