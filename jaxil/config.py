@@ -82,8 +82,8 @@ def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Conf
     config.encoder.strides = (2, 1, 1, 1)
     config.encoder.contrast = 1.0
     config.encoder.subtract_mean_image = False  # the demonstrations' mean, not 0.5
-    # On CPUs with a C compiler our own are used, in float32; "xla" never, "native" or
-    # not at all; see `jaxil.native`.
+    # "auto" takes our own on CPUs with GCC, in float32, where channels come in 32s, and
+    # XLA's elsewhere; "native" and "xla" take these or nothing. See `jaxil.native`.
     config.encoder.convolutions = "auto"
 
     config.demonstrations = ml_collections.ConfigDict()

@@ -37,6 +37,7 @@ from jaxil.learner.update import (
     init_train_state,
     make_update_step,
 )
+from jaxil.maths.convolution import NATIVE_FEATURES
 from jaxil.maths.types import ExpertEpisodes
 from jaxil.networks.agent import AgentNetworks, make_agent_networks
 from jaxil.rewarders.adversarial import make_adversarial_rewarder
@@ -87,15 +88,14 @@ def problems(config: Config) -> list[str]:
     Reads the demonstration file, but renders nothing.
     """
     faults = jaxil_config.problems(config, known_tasks())
+    fault = None
     if config.encoder.convolutions == "native":
-        fault = native.problem()
-        if config.compute_dtype != "float32":
-            fault = f"they are for float32, not compute_dtype={config.compute_dtype!r}"
-        if fault is not None:
-            faults.append(
-                f"encoder.convolutions='native' can't be had: {fault}; 'auto' takes "
-                "XLA's where it has to"
-            )
+        fault = _native_fault(config) or native.problem()
+    if fault is not None:
+        faults.append(
+            f"encoder.convolutions='native' can't be had: {fault}; 'auto' takes XLA's "
+            "where it has to"
+        )
     readable = config.task in known_tasks() and not any(
         fault.startswith(_READING_FIELDS) for fault in faults
     )
@@ -297,8 +297,22 @@ def make_networks(config: Config, action_dim: int, mean: Any) -> AgentNetworks:
 
 def uses_native_convolutions(config: Config) -> bool:
     """Returns whether the encoder's convolutions are our own, and loads them if so."""
-    wanted = config.encoder.convolutions != "xla" and config.observation == "pixels"
-    return wanted and config.compute_dtype == "float32" and native.problem() is None
+    wanted = config.encoder.convolutions != "xla" and _native_fault(config) is None
+    return wanted and native.problem() is None
+
+
+def _native_fault(config: Config) -> str | None:
+    """Returns why our own convolutions are not for a config."""
+    if config.observation != "pixels":
+        return f"they are for pixels, not observation={config.observation!r}"
+    if config.compute_dtype != "float32":
+        return f"they are for float32, not compute_dtype={config.compute_dtype!r}"
+    if any(channels % NATIVE_FEATURES for channels in config.encoder.channels):
+        return (
+            f"they make multiples of {NATIVE_FEATURES} channels, not "
+            f"encoder.channels={tuple(config.encoder.channels)}"
+        )
+    return None
 
 
 def mean_image(

@@ -10,6 +10,19 @@ import pytest
 from jaxil import config as jaxil_config
 from jaxil import doctor, experiment, native
 
+NOT_FOR_THESE = (
+    {"compute_dtype": "bfloat16"},
+    {"observation": "state"},
+    {"encoder.channels": (32, 32, 33, 32)},
+)
+
+
+def changed(config, changes):
+    """Returns a copy with other values, by dotted name."""
+    config = config.copy_and_resolve_references()
+    config.update_from_flattened_dict(changes)
+    return config
+
 
 @pytest.fixture(autouse=True)
 def _forgotten(monkeypatch):
@@ -126,12 +139,20 @@ def test_the_config_chooses():
     assert experiment.make_networks(config, 1, 0.5).encoder.native
     (finding,) = doctor.convolutions()
     assert finding.level == "ok"
-    for field, value in (("compute_dtype", "bfloat16"), ("observation", "state")):
-        other = config.copy_and_resolve_references()
-        other[field] = value
-        assert not experiment.uses_native_convolutions(other)
+    for changes in NOT_FOR_THESE:
+        assert not experiment.uses_native_convolutions(changed(config, changes))
     config.encoder.convolutions = "xla"
     assert not experiment.uses_native_convolutions(config)
+
+
+@pytest.mark.parametrize("changes", NOT_FOR_THESE)
+def test_who_insists_is_told_what_they_are_not_for(changes):
+    config = jaxil_config.default_config()
+    config.encoder.convolutions = "native"
+    assert experiment.problems(config) == []
+    (fault,) = experiment.problems(changed(config, changes))
+    (name,) = changes
+    assert f"{name}=" in fault
 
 
 @pytest.mark.usefixtures("without_compiler")
@@ -141,9 +162,6 @@ def test_who_insists_is_told_before_anything_starts():
     (fault,) = experiment.problems(config)
     assert "encoder.convolutions='native'" in fault
     assert "apt-get install gcc libc6-dev" in fault
-    config.compute_dtype = "bfloat16"
-    (fault,) = experiment.problems(config)
-    assert "compute_dtype='bfloat16'" in fault
 
 
 def test_an_unknown_form_is_a_fault():

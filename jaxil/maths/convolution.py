@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array, lax
 
 # Our own takes features by two vectors of a processor; no CPU's vectors are longer.
-_NATIVE_FEATURES = 32
+NATIVE_FEATURES = 32
 
 
 def convolve_relu(
@@ -34,7 +34,7 @@ def convolve_relu(
     """
     chex.assert_rank([images, kernel, bias], [4, 4, 1])
     chex.assert_equal(bias.shape[0], kernel.shape[3])
-    fits = kernel.shape[3] % _NATIVE_FEATURES == 0
+    fits = kernel.shape[3] % NATIVE_FEATURES == 0
     if native and fits and images.dtype == jnp.float32:
         return _NATIVE(stride, images, kernel, bias)
     return jax.nn.relu(_XLA(stride, images, kernel) + bias[None, None, None])
@@ -127,7 +127,7 @@ def _native_backward(
     kernel_gradient, bias_gradient = _call(
         "jaxil_kernel_gradient", gradients, stride, images, y, cotangent
     )
-    if stride == 1 and kernel.shape[2] % _NATIVE_FEATURES == 0:
+    if stride == 1 and kernel.shape[2] % NATIVE_FEATURES == 0:
         image_gradient = _call(
             "jaxil_image_gradient", _array(*images.shape), stride, kernel, y, cotangent
         )
