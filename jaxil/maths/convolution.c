@@ -247,9 +247,11 @@ static XLA_FFI_Error *no_memory(XLA_FFI_CallFrame *frame) {
 
 /* Says which interface this was compiled for, where XLA asks for no more than that. */
 static int answers_metadata(XLA_FFI_CallFrame *frame) {
-  XLA_FFI_Extension_Base *extension = frame->extension_start;
-  if (extension == NULL || extension->type != XLA_FFI_Extension_Metadata) return 0;
-  XLA_FFI_Metadata *metadata = ((XLA_FFI_Metadata_Extension *)extension)->metadata;
+  /* Its type has another name in jaxlib 0.10 than in 0.12. */
+  const void *extension = frame->extension_start;
+  if (extension == NULL || frame->extension_start->type != XLA_FFI_Extension_Metadata)
+    return 0;
+  XLA_FFI_Metadata *metadata = ((const XLA_FFI_Metadata_Extension *)extension)->metadata;
   metadata->api_version.major_version = XLA_FFI_API_MAJOR;
   metadata->api_version.minor_version = XLA_FFI_API_MINOR;
   return 1;
