@@ -64,7 +64,8 @@ typedef struct {
   size_t stride, out_height, out_width;         /* of the output */
 } Shape;
 
-INLINE Vector relu(Vector x) { return (Vector)((Mask)x & (x > (Vector){0})); }
+/* What is no number stays so, as in jax: a run that diverges has to be seen. */
+INLINE Vector relu(Vector x) { return (Vector)((Mask)x & ~(x <= (Vector){0})); }
 
 /* y[p] = sum over u, k of x[p step + u row + k] w[u, k], for a pair of vectors. */
 INLINE void convolve_points(size_t n, const float *x, size_t step, size_t row,

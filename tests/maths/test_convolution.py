@@ -198,6 +198,22 @@ def test_what_the_native_form_does_not_take_is_xlas(dtype):
     assert "ffi_call" not in program(True)
 
 
+@pytest.mark.parametrize("is_native", [False, True])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_not_hidden(is_native, value):
+    # Of three images the second has one such pixel; its windows show it, no others.
+    images, kernel, bias = draw(5, (3, 5, 6, 2), (3, 3, 2, FEATURES))
+    images = images.at[1, 2, 3, 0].set(value)
+    run = jax.jit(
+        functools.partial(convolution.convolve_relu, stride=1, native=is_native)
+    )
+    y, expected = run(images, kernel, bias), reference(images, kernel, bias, 1)
+    np.testing.assert_array_equal(np.isfinite(y), np.isfinite(expected))
+    np.testing.assert_array_equal(np.isnan(y), np.isnan(expected))
+    assert not np.isfinite(np.asarray(y[1])).all()
+    assert np.isfinite(np.asarray(y)[::2]).all()
+
+
 def test_gradients_of_linear_layers_are_adjoint():
     # Where ReLU is open everywhere y is linear: <y, g> = <x, dx> = <k, dk>, and <b, db>
     # is what the bias contributes.
