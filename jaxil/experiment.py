@@ -89,7 +89,8 @@ def problems(config: Config) -> list[str]:
     """
     faults = jaxil_config.problems(config, known_tasks())
     fault = None
-    if config.encoder.convolutions == "native":
+    has_encoder = not any(each.startswith("encoder") for each in faults)
+    if config.encoder.convolutions == "native" and has_encoder:
         fault = _native_fault(config) or native.problem()
     if fault is not None:
         faults.append(

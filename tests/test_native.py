@@ -164,6 +164,14 @@ def test_who_insists_is_told_before_anything_starts():
     assert "apt-get install gcc libc6-dev" in fault
 
 
+def test_a_broken_encoder_is_the_only_fault():
+    config = jaxil_config.default_config()
+    config.encoder.convolutions = "native"
+    config.encoder.channels = (32, "32", 32, 32)
+    (fault,) = experiment.problems(config)
+    assert "encoder.channels" in fault
+
+
 def test_an_unknown_form_is_a_fault():
     config = jaxil_config.default_config()
     config.encoder.convolutions = "cuda"
