@@ -18,7 +18,8 @@ import jax
 
 from jaxil import platform
 
-_SOURCE = pathlib.Path(__file__).parent / "maths" / "convolution.c"
+_SOURCES = pathlib.Path(__file__).parent / "maths"
+_SOURCE = _SOURCES / "convolution.c"
 _FUNCTIONS = ("jaxil_convolve_relu", "jaxil_kernel_gradient", "jaxil_image_gradient")
 _COMPILERS = ("gcc", "cc")
 FLAGS = ("-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared")
@@ -63,8 +64,10 @@ def build(folder: pathlib.Path, flags: tuple[str, ...] = FLAGS) -> pathlib.Path:
     Raises:
       BuildError: there is no compiler, or it failed.
     """
-    digest = hashlib.sha256(_SOURCE.read_bytes() + repr(flags).encode()).hexdigest()[:8]
-    path = folder / f"convolution-{digest}.so"
+    digest = hashlib.sha256(repr(flags).encode())
+    for source in (_SOURCE, *sorted(_SOURCES.glob("*.h"))):
+        digest.update(source.read_bytes())
+    path = folder / f"convolution-{digest.hexdigest()[:8]}.so"
     if path.exists():
         return path
     compiler = os.environ.get("CC") or next(filter(shutil.which, _COMPILERS), None)

@@ -3,11 +3,8 @@
    `convolution.py` says what each function computes; shapes and names are its own. All
    arrays are float32, channels last, and VALID: every window lies in its image.
 
-   A convolution is a sum of products of one number with a vector of features. A block
-   of BLOCK points times two vectors is summed up in registers: that many independent
-   sums hide the latency of a multiply-add, and each vector that is loaded is used BLOCK
-   times. Both lengths are known to the compiler, which unrolls what loops over them.
-   Features have to come in multiples of two vectors. */
+   This file is XLA's side: buffers in, buffers out, images shared out to threads. What
+   is done with an image is in the two headers. */
 
 #include <sched.h>
 #include <stdatomic.h>
@@ -15,159 +12,21 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "convolution_blocks.h"
+#include "convolution_winograd.h"
 #include "xla/ffi/api/c_api.h"
-
-#if defined(__clang__)
-#error "it is for GCC: what clang makes of it is half as fast as XLA's"
-#endif
-
-/* Of 32 registers 28 are sums, of 16 registers 12. */
-#if defined(__AVX512F__)
-#define LANES 16
-#define BLOCK 14
-#elif defined(__AVX2__) && defined(__FMA__)
-#define LANES 8
-#define BLOCK 6
-#else
-#error "it is for processors with AVX2 and FMA"
-#endif
-#define PAIR (2 * LANES)
-
-typedef float Vector __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
-typedef int32_t Mask __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
-
-#define INLINE static inline __attribute__((always_inline))
-#define UNROLL _Pragma("GCC unroll 16")
-
-/* Calls FUNCTION(n, ...) with an n that the compiler knows. */
-#define WITH_KNOWN(n, FUNCTION, ...)               \
-  switch (n) {                                     \
-    case 1: FUNCTION(1, __VA_ARGS__); break;       \
-    case 2: FUNCTION(2, __VA_ARGS__); break;       \
-    case 3: FUNCTION(3, __VA_ARGS__); break;       \
-    case 4: FUNCTION(4, __VA_ARGS__); break;       \
-    case 5: FUNCTION(5, __VA_ARGS__); break;       \
-    case 6: FUNCTION(6, __VA_ARGS__); break;       \
-    case 7: FUNCTION(7, __VA_ARGS__); break;       \
-    case 8: FUNCTION(8, __VA_ARGS__); break;       \
-    case 9: FUNCTION(9, __VA_ARGS__); break;       \
-    case 10: FUNCTION(10, __VA_ARGS__); break;     \
-    case 11: FUNCTION(11, __VA_ARGS__); break;     \
-    case 12: FUNCTION(12, __VA_ARGS__); break;     \
-    case 13: FUNCTION(13, __VA_ARGS__); break;     \
-    case 14: FUNCTION(14, __VA_ARGS__); break;     \
-  }
-
-typedef struct {
-  size_t batch, height, width, channels;        /* of the images */
-  size_t kernel_height, kernel_width, features; /* of the kernel */
-  size_t stride, out_height, out_width;         /* of the output */
-} Shape;
-
-/* What is no number stays so, as in jax: a run that diverges has to be seen. */
-INLINE Vector relu(Vector x) { return (Vector)((Mask)x & ~(x <= (Vector){0})); }
-
-/* y[p] = sum over u, k of x[p step + u row + k] w[u, k], for a pair of vectors. */
-INLINE void convolve_points(size_t n, const float *x, size_t step, size_t row,
-                            size_t rows, size_t length, const float *w,
-                            const float *bias, float *y, size_t features) {
-  Vector low[BLOCK], high[BLOCK];
-  UNROLL for (size_t p = 0; p < n; p++) {
-    low[p] = bias ? *(const Vector *)bias : (Vector){0};
-    high[p] = bias ? *(const Vector *)(bias + LANES) : (Vector){0};
-  }
-  for (size_t u = 0; u < rows; u++) {
-    for (size_t k = 0; k < length; k++) {
-      const Vector w_low = *(const Vector *)w, w_high = *(const Vector *)(w + LANES);
-      UNROLL for (size_t p = 0; p < n; p++) {
-        low[p] += x[u * row + p * step + k] * w_low;
-        high[p] += x[u * row + p * step + k] * w_high;
-      }
-      w += features;
-    }
-  }
-  UNROLL for (size_t p = 0; p < n; p++) {
-    *(Vector *)(y + p * features) = bias ? relu(low[p]) : low[p];
-    *(Vector *)(y + p * features + LANES) = bias ? relu(high[p]) : high[p];
-  }
-}
-
-/* w[k] += sum over i, j of x[i row + j step + k] g[i, j], for a pair of vectors. */
-INLINE void correlate_points(size_t n, const float *x, size_t step, size_t row,
-                             size_t height, size_t width, const float *g, float *w,
-                             size_t features) {
-  Vector low[BLOCK], high[BLOCK];
-  UNROLL for (size_t k = 0; k < n; k++) {
-    low[k] = *(const Vector *)(w + k * features);
-    high[k] = *(const Vector *)(w + k * features + LANES);
-  }
-  for (size_t i = 0; i < height; i++) {
-    const float *here = x + i * row;
-    for (size_t j = 0; j < width; j++) {
-      const Vector g_low = *(const Vector *)g, g_high = *(const Vector *)(g + LANES);
-      UNROLL for (size_t k = 0; k < n; k++) {
-        low[k] += here[k] * g_low;
-        high[k] += here[k] * g_high;
-      }
-      here += step;
-      g += features;
-    }
-  }
-  UNROLL for (size_t k = 0; k < n; k++) {
-    *(Vector *)(w + k * features) = low[k];
-    *(Vector *)(w + k * features + LANES) = high[k];
-  }
-}
-
-/* y = relu(x * w + bias) of one image; without bias y = x * w. */
-static void convolve(const Shape *s, const float *x, const float *w, const float *bias,
-                     float *y) {
-  const size_t row = s->width * s->channels, step = s->stride * s->channels;
-  const size_t length = s->kernel_width * s->channels;
-  const size_t blocks = (s->out_width + BLOCK - 1) / BLOCK;
-  for (size_t i = 0; i < s->out_height; i++)
-    for (size_t f = 0; f < s->features; f += PAIR)
-      for (size_t q = 0; q < blocks; q++) {
-        const size_t j = s->out_width * q / blocks;
-        const size_t n = s->out_width * (q + 1) / blocks - j;
-        WITH_KNOWN(n, convolve_points, x + i * s->stride * row + j * step, step, row,
-                   s->kernel_height, length, w + f, bias ? bias + f : NULL,
-                   y + (i * s->out_width + j) * s->features + f, s->features)
-      }
-}
-
-/* w += what one image and the cotangent g of its output mean for the kernel. */
-static void correlate(const Shape *s, const float *x, const float *g, float *w) {
-  const size_t row = s->width * s->channels, step = s->stride * s->channels;
-  const size_t length = s->kernel_width * s->channels;
-  const size_t blocks = (length + BLOCK - 1) / BLOCK;
-  for (size_t u = 0; u < s->kernel_height; u++)
-    for (size_t q = 0; q < blocks; q++) {
-      const size_t k = length * q / blocks, n = length * (q + 1) / blocks - k;
-      for (size_t f = 0; f < s->features; f += PAIR)
-        WITH_KNOWN(n, correlate_points, x + u * row + k, step, s->stride * row,
-                   s->out_height, s->out_width, g + f,
-                   w + (u * length + k) * s->features + f, s->features)
-    }
-}
-
-/* g = what a cotangent of relu(z) means for z, where y = relu(z). */
-INLINE void pass_relu(const float *y, const float *cotangent, float *g, size_t size) {
-  for (size_t k = 0; k < size; k++) g[k] = y[k] > 0.0f ? cotangent[k] : 0.0f;
-}
-
-/* What follows is XLA's side: buffers in, buffers out, images shared out to threads. */
 
 typedef struct {
   Shape shape;
   const float *images, *kernel, *bias, *y, *cotangent;
   float *output;
+  int winograd; /* whether the kernel, or its gradient, is the transformed one */
   atomic_int out_of_memory;
 } Call;
 
-typedef void Work(Call *call, size_t image);
+typedef void Work(Call *call, size_t part);
 
-/* Images that are handed out one by one. The last of its users frees it. */
+/* Parts of a batch that are handed out one by one. The last of its users frees it. */
 typedef struct {
   Work *work;
   Call *call;
@@ -181,9 +40,9 @@ static void leave(Team *team) {
 
 static void take_part(void *data) {
   Team *team = data;
-  size_t image;
-  while ((image = atomic_fetch_add(&team->next, 1)) < team->count) {
-    team->work(team->call, image);
+  size_t part;
+  while ((part = atomic_fetch_add(&team->next, 1)) < team->count) {
+    team->work(team->call, part);
     atomic_fetch_add(&team->done, 1);
   }
   leave(team);
@@ -211,14 +70,14 @@ static size_t number_of_threads(XLA_FFI_CallFrame *frame) {
   return known && threads > 1 ? (size_t)threads : 1;
 }
 
-/* Works on all images, with the threads of XLA that are free. A thread that comes too
-   late finds none left; so only images in work are waited for, and that always ends. */
-static void for_each_image(XLA_FFI_CallFrame *frame, Work *work, Call *call) {
-  const size_t count = call->shape.batch, threads = number_of_threads(frame);
+/* Works on all parts, with the threads of XLA that are free. A thread that comes too
+   late finds none left; so only parts in work are waited for, and that always ends. */
+static void for_each(size_t count, XLA_FFI_CallFrame *frame, Work *work, Call *call) {
+  const size_t threads = number_of_threads(frame);
   const size_t members = threads < count ? threads : count;
   Team *team = members > 1 ? malloc(sizeof(Team)) : NULL;
   if (team == NULL) {
-    for (size_t image = 0; image < count; image++) work(call, image);
+    for (size_t part = 0; part < count; part++) work(call, part);
     return;
   }
   *team = (Team){.work = work, .call = call, .count = count};
@@ -291,10 +150,29 @@ static size_t kernel_size(const Shape *s) {
   return s->kernel_height * s->kernel_width * s->channels * s->features;
 }
 
+/* Memory for one part of a batch; NULL, and the call fails, if there is none. */
+static float *scratch_for(Call *call, size_t size) {
+  float *scratch = malloc(size * sizeof(float));
+  if (scratch == NULL) atomic_store(&call->out_of_memory, 1);
+  return scratch;
+}
+
+/* y = relu(x * kernel + bias) of one image of shape s, or x * kernel without bias. */
+static void convolve_either(Call *call, const Shape *s, const float *x, float *y) {
+  if (!call->winograd) {
+    convolve(s, x, call->kernel, call->bias, y);
+    return;
+  }
+  float *scratch = scratch_for(call, winograd_convolve_scratch(s));
+  if (scratch == NULL) return;
+  winograd_convolve(s, x, call->kernel, call->bias, y, scratch);
+  free(scratch);
+}
+
 static void convolve_image(Call *call, size_t image) {
   const Shape *s = &call->shape;
-  convolve(s, call->images + image * image_size(s), call->kernel, call->bias,
-           call->output + image * output_size(s));
+  convolve_either(call, s, call->images + image * image_size(s),
+                  call->output + image * output_size(s));
 }
 
 /* images, kernel, bias -> y */
@@ -309,33 +187,55 @@ XLA_FFI_Error *jaxil_convolve_relu(XLA_FFI_CallFrame *frame) {
       .bias = argument(frame, 2)->data,
       .output = y->data,
   };
-  for_each_image(frame, convolve_image, &call);
-  return NULL;
+  const Shape *s = &call.shape;
+  float *transformed = NULL;
+  if (suits_winograd(s)) {
+    transformed = malloc(ELEMENTS * s->channels * s->features * sizeof(float));
+    if (transformed == NULL) return no_memory(frame);
+    transform_kernel(s, kernel->data, transformed);
+    call.kernel = transformed;
+    call.winograd = 1;
+  }
+  for_each(s->batch, frame, convolve_image, &call);
+  free(transformed);
+  return atomic_load(&call.out_of_memory) ? no_memory(frame) : NULL;
 }
 
-/* Of one image: the gradients of the kernel and, behind it, of the bias. */
-static void correlate_image(Call *call, size_t image) {
+/* So many images have one sum of their kernel gradients. It is a constant, and the sums
+   are added up in order: the result doesn't depend on the number of threads. */
+#define IMAGES_OF_A_SUM 4
+
+/* Numbers in a sum: the gradient of the kernel, plain or transformed, and of the bias. */
+static size_t gradient_size(const Call *call) {
   const Shape *s = &call->shape;
-  const size_t size = output_size(s), weights = kernel_size(s);
-  float *kernel = call->output + image * (weights + s->features);
-  float *bias = kernel + weights;
-  float *g = malloc(size * sizeof(float));
-  if (g == NULL) {
-    atomic_store(&call->out_of_memory, 1);
-    return;
+  const size_t pairs = s->channels * s->features;
+  return (call->winograd ? ELEMENTS * pairs : kernel_size(s)) + s->features;
+}
+
+static void correlate_images(Call *call, size_t part) {
+  const Shape *s = &call->shape;
+  const size_t size = output_size(s), first = part * IMAGES_OF_A_SUM;
+  const size_t end = first + IMAGES_OF_A_SUM;
+  float *kernel = call->output + part * gradient_size(call);
+  float *bias = kernel + gradient_size(call) - s->features;
+  float *g = scratch_for(
+      call, size + (call->winograd ? winograd_correlate_scratch(s) : 0));
+  if (g == NULL) return;
+  memset(kernel, 0, gradient_size(call) * sizeof(float));
+  for (size_t image = first; image < end && image < s->batch; image++) {
+    const float *x = call->images + image * image_size(s);
+    pass_relu(call->y + image * size, call->cotangent + image * size, g, size);
+    for (size_t p = 0; p < size; p += s->features)
+      for (size_t f = 0; f < s->features; f++) bias[f] += g[p + f];
+    if (call->winograd)
+      winograd_correlate(s, x, g, kernel, g + size);
+    else
+      correlate(s, x, g, kernel);
   }
-  pass_relu(call->y + image * size, call->cotangent + image * size, g, size);
-  memset(kernel, 0, (weights + s->features) * sizeof(float));
-  for (size_t p = 0; p < size; p += s->features)
-    for (size_t f = 0; f < s->features; f++) bias[f] += g[p + f];
-  correlate(s, call->images + image * image_size(s), g, kernel);
   free(g);
 }
 
-/* images, y, cotangent -> kernel's gradient, bias's gradient
-
-   Each image has sums of its own, added up in their order: the result doesn't depend
-   on the number of threads. */
+/* images, y, cotangent -> kernel's gradient, bias's gradient */
 XLA_FFI_Error *jaxil_kernel_gradient(XLA_FFI_CallFrame *frame) {
   if (answers_metadata(frame)) return NULL;
   const XLA_FFI_Buffer *images = argument(frame, 0), *y = argument(frame, 1);
@@ -346,29 +246,31 @@ XLA_FFI_Error *jaxil_kernel_gradient(XLA_FFI_CallFrame *frame) {
       .y = y->data,
       .cotangent = argument(frame, 2)->data,
   };
-  const size_t weights = kernel_size(&call.shape), features = call.shape.features;
-  call.output = malloc(call.shape.batch * (weights + features) * sizeof(float));
-  if (call.output == NULL) return no_memory(frame);
-  for_each_image(frame, correlate_image, &call);
-  memset(kernel->data, 0, weights * sizeof(float));
-  memset(bias->data, 0, features * sizeof(float));
-  const float *part = call.output;
-  for (size_t image = 0; image < call.shape.batch; image++) {
-    for (size_t k = 0; k < weights; k++) ((float *)kernel->data)[k] += *part++;
-    for (size_t f = 0; f < features; f++) ((float *)bias->data)[f] += *part++;
-  }
-  free(call.output);
+  const Shape *s = &call.shape;
+  call.winograd = suits_winograd(s);
+  const size_t sums = (s->batch + IMAGES_OF_A_SUM - 1) / IMAGES_OF_A_SUM;
+  const size_t size = gradient_size(&call), features = s->features;
+  float *total = call.output = malloc(sums * size * sizeof(float));
+  if (total == NULL) return no_memory(frame);
+  for_each(sums, frame, correlate_images, &call);
+  for (size_t sum = 1; sum < sums; sum++)
+    for (size_t k = 0; k < size; k++) total[k] += total[sum * size + k];
+  if (call.winograd)
+    transform_gradient(s, total, kernel->data);
+  else
+    memcpy(kernel->data, total, kernel_size(s) * sizeof(float));
+  memcpy(bias->data, total + size - features, features * sizeof(float));
+  free(total);
   return atomic_load(&call.out_of_memory) ? no_memory(frame) : NULL;
 }
 
-/* Of one image: the cotangent, with a border of zeros as wide as the kernel reaches,
-   convolved with the kernel turned around. */
-static void spread_image(Call *call, size_t image) {
-  const Shape *s = &call->shape;
-  const size_t down = s->kernel_height - 1, right = s->kernel_width - 1;
-  const Shape back = {
-      .height = s->out_height + 2 * down,
-      .width = s->out_width + 2 * right,
+/* Of a convolution without stride: the one that gives the gradient of its images, which
+   is one of the cotangent, framed with zeros as far as the kernel reaches. */
+static Shape transposed(const Shape *s) {
+  return (Shape){
+      .batch = s->batch,
+      .height = s->out_height + 2 * (s->kernel_height - 1),
+      .width = s->out_width + 2 * (s->kernel_width - 1),
       .channels = s->features,
       .kernel_height = s->kernel_height,
       .kernel_width = s->kernel_width,
@@ -377,6 +279,10 @@ static void spread_image(Call *call, size_t image) {
       .out_height = s->height,
       .out_width = s->width,
   };
+}
+
+static void spread_image(Call *call, size_t image) {
+  const Shape *s = &call->shape, back = transposed(s);
   float *framed = calloc(image_size(&back), sizeof(float));
   if (framed == NULL) {
     atomic_store(&call->out_of_memory, 1);
@@ -385,11 +291,22 @@ static void spread_image(Call *call, size_t image) {
   const size_t length = s->out_width * s->features;
   for (size_t i = 0; i < s->out_height; i++) {
     const size_t at = image * output_size(s) + i * length;
+    const size_t row = i + s->kernel_height - 1, column = s->kernel_width - 1;
     pass_relu(call->y + at, call->cotangent + at,
-              framed + ((i + down) * back.width + right) * s->features, length);
+              framed + (row * back.width + column) * s->features, length);
   }
-  convolve(&back, framed, call->kernel, NULL, call->output + image * image_size(s));
+  convolve_either(call, &back, framed, call->output + image * image_size(s));
   free(framed);
+}
+
+/* to[v, f, c] = from[last - v, c, f]: the kernel of the transposed convolution. */
+static void turn_kernel(const Shape *s, const float *from, float *to) {
+  const size_t window = s->kernel_height * s->kernel_width;
+  for (size_t v = 0; v < window; v++)
+    for (size_t c = 0; c < s->channels; c++)
+      for (size_t f = 0; f < s->features; f++)
+        to[((window - 1 - v) * s->features + f) * s->channels + c] =
+            from[(v * s->channels + c) * s->features + f];
 }
 
 /* kernel, y, cotangent -> images' gradient, of a convolution without stride */
@@ -403,17 +320,19 @@ XLA_FFI_Error *jaxil_image_gradient(XLA_FFI_CallFrame *frame) {
       .cotangent = argument(frame, 2)->data,
       .output = images->data,
   };
-  const Shape *s = &call.shape;
-  const size_t window = s->kernel_height * s->kernel_width;
-  float *turned = malloc(kernel_size(s) * sizeof(float));
+  const Shape *s = &call.shape, back = transposed(s);
+  call.winograd = suits_winograd(&back);
+  const size_t transformed = ELEMENTS * s->channels * s->features;
+  float *turned = malloc(
+      (kernel_size(s) + (call.winograd ? transformed : 0)) * sizeof(float));
   if (turned == NULL) return no_memory(frame);
-  for (size_t v = 0; v < window; v++)
-    for (size_t c = 0; c < s->channels; c++)
-      for (size_t f = 0; f < s->features; f++)
-        turned[((window - 1 - v) * s->features + f) * s->channels + c] =
-            ((float *)kernel->data)[(v * s->channels + c) * s->features + f];
+  turn_kernel(s, kernel->data, turned);
   call.kernel = turned;
-  for_each_image(frame, spread_image, &call);
+  if (call.winograd) {
+    call.kernel = turned + kernel_size(s);
+    transform_kernel(&back, turned, turned + kernel_size(s));
+  }
+  for_each(s->batch, frame, spread_image, &call);
   free(turned);
   return atomic_load(&call.out_of_memory) ? no_memory(frame) : NULL;
 }

@@ -1,0 +1,252 @@
+/* Winograd's convolution of 3x3 kernels: 4 products in place of 9 for each output.
+
+   A tile of 4x4 points of an image makes 2x2 points of the output:
+
+       Y = A' [(G k G') * (B' X B)] A,   * elementwise, summed over channels
+
+   (Lavin and Gray, 2016, arXiv 1509.09308, F(2x2, 3x3)). Each of the 16 elements is a
+   product of a matrix tiles x channels with one channels x features. The kernel's
+   gradient is the transpose of it:
+
+       dk = G' [sum over tiles of (B' X B) * (A dY A')] G
+
+   The factors are 1 and 1/2, and a sum has 32 terms where it had 288: rounding errors
+   are no larger than those of the plain sum. */
+
+#ifndef JAXIL_CONVOLUTION_WINOGRAD_H
+#define JAXIL_CONVOLUTION_WINOGRAD_H
+
+#include <string.h>
+
+#include "convolution_blocks.h"
+
+#define SIDE 4 /* of a tile of the image; of the output it is 2 */
+#define ELEMENTS (SIDE * SIDE)
+
+/* y = B' x, of vectors that lie `step` apart. */
+INLINE void image_transform(const Vector *x, Vector *y, size_t step) {
+  y[0] = x[0] - x[2 * step];
+  y[step] = x[step] + x[2 * step];
+  y[2 * step] = x[2 * step] - x[step];
+  y[3 * step] = x[step] - x[3 * step];
+}
+
+/* y = A' x */
+INLINE void output_transform(const Vector *x, Vector *y, size_t step) {
+  y[0] = x[0] + x[step] + x[2 * step];
+  y[step] = x[step] - x[2 * step] - x[3 * step];
+}
+
+/* y = A x */
+INLINE void cotangent_transform(const Vector *x, Vector *y, size_t step) {
+  y[0] = x[0];
+  y[step] = x[0] + x[step];
+  y[2 * step] = x[0] - x[step];
+  y[3 * step] = -x[step];
+}
+
+/* y = G x */
+INLINE void kernel_transform(const Vector *x, Vector *y, size_t step) {
+  const Vector even = 0.5f * (x[0] + x[2 * step]), odd = 0.5f * x[step];
+  y[0] = x[0];
+  y[step] = even + odd;
+  y[2 * step] = even - odd;
+  y[3 * step] = x[2 * step];
+}
+
+/* y = G' x */
+INLINE void gradient_transform(const Vector *x, Vector *y, size_t step) {
+  const Vector even = 0.5f * (x[step] + x[2 * step]);
+  y[0] = x[0] + even;
+  y[step] = 0.5f * (x[step] - x[2 * step]);
+  y[2 * step] = even + x[3 * step];
+}
+
+/* y[i][j] = T x T' of n x n vectors, where T makes m vectors of n: columns, then rows.
+   Both arrays have rows of SIDE vectors. */
+#define TRANSFORM(T, n, m, x, y)                                          \
+  do {                                                                    \
+    Vector half[SIDE][SIDE];                                              \
+    UNROLL for (size_t j_ = 0; j_ < (n); j_++) T(&x[0][j_], &half[0][j_], SIDE); \
+    UNROLL for (size_t i_ = 0; i_ < (m); i_++) T(half[i_], y[i_], 1);      \
+  } while (0)
+
+/* Which tile of an image: its first point of the output. In an odd row or column the
+   last tile begins one point early, and has `again` rows or columns that another tile
+   has had. */
+typedef struct {
+  size_t i, j, i_again, j_again;
+} Tile;
+
+static inline size_t halves(size_t n) { return (n + 1) / 2; }
+
+INLINE Tile tile_at(const Shape *s, size_t index) {
+  const size_t across = halves(s->out_width);
+  const size_t i = index / across * 2, j = index % across * 2;
+  const size_t i_again = i + 2 > s->out_height, j_again = j + 2 > s->out_width;
+  return (Tile){i - i_again, j - j_again, i_again, j_again};
+}
+
+static size_t count_tiles(const Shape *s) {
+  return halves(s->out_height) * halves(s->out_width);
+}
+
+/* Whether a convolution, or its gradient for the kernel, can be computed so. */
+static int suits_winograd(const Shape *s) {
+  return s->kernel_height == 3 && s->kernel_width == 3 && s->stride == 1 &&
+         s->channels % PAIR == 0 && s->out_height >= 2 && s->out_width >= 2;
+}
+
+/* u[element, c, f] = (G k G')[element] of k[3, 3, c, f] */
+static void transform_kernel(const Shape *s, const float *kernel, float *u) {
+  const size_t size = s->channels * s->features;
+  for (size_t k = 0; k < size; k += LANES) {
+    Vector x[SIDE][SIDE], y[SIDE][SIDE];
+    UNROLL for (size_t v = 0; v < 9; v++)
+        x[v / 3][v % 3] = *(const Vector *)(kernel + v * size + k);
+    TRANSFORM(kernel_transform, 3, SIDE, x, y);
+    UNROLL for (size_t e = 0; e < ELEMENTS; e++)
+        *(Vector *)(u + e * size + k) = y[e / SIDE][e % SIDE];
+  }
+}
+
+/* dk[3, 3, c, f] = (G' u G)[c, f] */
+static void transform_gradient(const Shape *s, const float *u, float *gradient) {
+  const size_t size = s->channels * s->features;
+  for (size_t k = 0; k < size; k += LANES) {
+    Vector x[SIDE][SIDE], y[SIDE][SIDE];
+    UNROLL for (size_t e = 0; e < ELEMENTS; e++)
+        x[e / SIDE][e % SIDE] = *(const Vector *)(u + e * size + k);
+    TRANSFORM(gradient_transform, SIDE, 3, x, y);
+    UNROLL for (size_t v = 0; v < 9; v++)
+        *(Vector *)(gradient + v * size + k) = y[v / 3][v % 3];
+  }
+}
+
+/* points[element, c] = (B' X B)[element] of one tile; elements lie `step` apart. */
+INLINE void transform_tile(const Shape *s, const float *x, Tile tile, float *points,
+                           size_t step) {
+  const float *from = x + (tile.i * s->width + tile.j) * s->channels;
+  for (size_t c = 0; c < s->channels; c += LANES) {
+    Vector d[SIDE][SIDE], e[SIDE][SIDE];
+    UNROLL for (size_t k = 0; k < ELEMENTS; k++)
+        d[k / SIDE][k % SIDE] = *(const Vector *)(
+            from + (k / SIDE * s->width + k % SIDE) * s->channels + c);
+    TRANSFORM(image_transform, SIDE, SIDE, d, e);
+    UNROLL for (size_t k = 0; k < ELEMENTS; k++)
+        *(Vector *)(points + k * step + c) = e[k / SIDE][k % SIDE];
+  }
+}
+
+/* y[i, j, f] = relu((A' sums A)[i, j] + bias) of one tile; without bias no relu. */
+INLINE void finish_tile(const Shape *s, const float *sums, size_t step, Tile tile,
+                        const float *bias, float *y) {
+  float *to = y + (tile.i * s->out_width + tile.j) * s->features;
+  for (size_t f = 0; f < s->features; f += LANES) {
+    Vector d[SIDE][SIDE], e[2][SIDE];
+    UNROLL for (size_t k = 0; k < ELEMENTS; k++)
+        d[k / SIDE][k % SIDE] = *(const Vector *)(sums + k * step + f);
+    TRANSFORM(output_transform, SIDE, 2, d, e);
+    UNROLL for (size_t k = 0; k < 4; k++) {
+      const Vector z = e[k / 2][k % 2];
+      *(Vector *)(to + (k / 2 * s->out_width + k % 2) * s->features + f) =
+          bias ? relu(z + *(const Vector *)(bias + f)) : z;
+    }
+  }
+}
+
+/* points[element, f] = (A dY A')[element] of one tile. */
+INLINE void transform_cotangent(const Shape *s, const float *g, Tile tile,
+                                float *points, size_t step) {
+  const float *from = g + (tile.i * s->out_width + tile.j) * s->features;
+  for (size_t f = 0; f < s->features; f += LANES) {
+    Vector d[2][SIDE], e[SIDE][SIDE];
+    UNROLL for (size_t k = 0; k < 4; k++) {
+      const int again = k / 2 < tile.i_again || k % 2 < tile.j_again;
+      const float *at = from + (k / 2 * s->out_width + k % 2) * s->features + f;
+      d[k / 2][k % 2] = again ? (Vector){0} : *(const Vector *)at;
+    }
+    TRANSFORM(cotangent_transform, 2, SIDE, d, e);
+    UNROLL for (size_t k = 0; k < ELEMENTS; k++)
+        *(Vector *)(points + k * step + f) = e[k / SIDE][k % SIDE];
+  }
+}
+
+/* Asks for part k of n of an array. Tiles are read and written in bursts between the
+   products: without this a core would wait for the memory in each of them, and idle
+   the memory in between. */
+INLINE void prefetch(const float *array, size_t size, size_t k, size_t n) {
+  const size_t line = 64 / sizeof(float);
+  for (size_t p = size * k / n; p < size * (k + 1) / n; p += line)
+    __builtin_prefetch(array + p, 0, 2);
+}
+
+/* How many numbers `winograd_convolve` wants as its scratch: a block of tiles. */
+static size_t winograd_convolve_scratch(const Shape *s) {
+  return ELEMENTS * BLOCK * (s->channels + s->features);
+}
+
+/* y = relu(x * k + bias) of one image, u being the transformed kernel; without bias
+   y = x * k. */
+static void winograd_convolve(const Shape *s, const float *x, const float *u,
+                              const float *bias, float *y, float *scratch) {
+  const size_t tiles = count_tiles(s), blocks = (tiles + BLOCK - 1) / BLOCK;
+  const size_t step = BLOCK * s->channels, sums_step = BLOCK * s->features;
+  const size_t row = s->width * s->channels, y_row = s->out_width * s->features;
+  float *sums = scratch + ELEMENTS * step;
+  for (size_t q = 0; q < blocks; q++) {
+    const size_t t = tiles * q / blocks, n = tiles * (q + 1) / blocks - t;
+    for (size_t p = 0; p < n; p++)
+      transform_tile(s, x, tile_at(s, t + p), scratch + p * s->channels, step);
+    for (size_t e = 0; e < ELEMENTS; e++) {
+      const size_t part = (q + 1) * ELEMENTS + e, parts = blocks * ELEMENTS;
+      prefetch(x + SIDE * row, s->height * row, part, parts);
+      prefetch(y + y_row, s->out_height * y_row, part, parts);
+      for (size_t f = 0; f < s->features; f += PAIR)
+        WITH_KNOWN(n, convolve_points, scratch + e * step, s->channels, 0, 1,
+                   s->channels, u + e * s->channels * s->features + f, NULL,
+                   sums + e * sums_step + f, s->features)
+    }
+    for (size_t p = 0; p < n; p++)
+      finish_tile(s, sums + p * s->features, sums_step, tile_at(s, t + p), bias, y);
+  }
+}
+
+/* So many tiles stay in a core's own cache, and each sum is loaded once for them. */
+#define TILES 60
+
+static size_t winograd_correlate_scratch(const Shape *s) {
+  return ELEMENTS * TILES * (s->channels + s->features);
+}
+
+/* u[element, c, f] += what one image and the cotangent g of its output mean for the
+   transformed kernel. */
+static void winograd_correlate(const Shape *s, const float *x, const float *g, float *u,
+                               float *scratch) {
+  const size_t tiles = count_tiles(s), parts = (tiles + TILES - 1) / TILES;
+  const size_t step = TILES * s->channels, g_step = TILES * s->features;
+  float *cotangents = scratch + ELEMENTS * step;
+  const size_t blocks = (s->channels + BLOCK - 1) / BLOCK;
+  const size_t row = s->width * s->channels;
+  for (size_t q = 0; q < parts; q++) {
+    const size_t t = tiles * q / parts, n = tiles * (q + 1) / parts - t;
+    for (size_t p = 0; p < n; p++) {
+      const Tile tile = tile_at(s, t + p);
+      transform_tile(s, x, tile, scratch + p * s->channels, step);
+      transform_cotangent(s, g, tile, cotangents + p * s->features, g_step);
+    }
+    for (size_t e = 0; e < ELEMENTS; e++)
+      for (size_t b = 0; b < blocks; b++) {
+        const size_t c = s->channels * b / blocks;
+        const size_t m = s->channels * (b + 1) / blocks - c;
+        prefetch(x + SIDE * row, s->height * row, ((q + 1) * ELEMENTS + e) * blocks + b,
+                 parts * ELEMENTS * blocks);
+        for (size_t f = 0; f < s->features; f += PAIR)
+          WITH_KNOWN(m, correlate_points, scratch + e * step + c, s->channels, 0, 1, n,
+                     cotangents + e * g_step + f,
+                     u + (e * s->channels + c) * s->features + f, s->features)
+      }
+  }
+}
+
+#endif
