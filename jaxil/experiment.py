@@ -37,7 +37,7 @@ from jaxil.learner.update import (
     init_train_state,
     make_update_step,
 )
-from jaxil.maths.convolution import NATIVE_FEATURES
+from jaxil.maths import encoding
 from jaxil.maths.types import ExpertEpisodes
 from jaxil.networks.agent import AgentNetworks, make_agent_networks
 from jaxil.rewarders.adversarial import make_adversarial_rewarder
@@ -308,10 +308,16 @@ def _native_fault(config: Config) -> str | None:
         return f"they are for pixels, not observation={config.observation!r}"
     if config.compute_dtype != "float32":
         return f"they are for float32, not compute_dtype={config.compute_dtype!r}"
-    if any(channels % NATIVE_FEATURES for channels in config.encoder.channels):
+    channels = tuple(config.encoder.channels)
+    if any(each % encoding.FEATURES for each in channels):
         return (
-            f"they make multiples of {NATIVE_FEATURES} channels, not "
-            f"encoder.channels={tuple(config.encoder.channels)}"
+            f"they make multiples of {encoding.FEATURES} channels, not "
+            f"encoder.channels={channels}"
+        )
+    if len(channels) > encoding.MOST_LAYERS:
+        return (
+            f"they have at most {encoding.MOST_LAYERS} layers, not the {len(channels)} "
+            f"of encoder.channels={channels}"
         )
     return None
 

@@ -19,8 +19,8 @@ import jax
 from jaxil import platform
 
 _SOURCES = pathlib.Path(__file__).parent / "maths"
-_SOURCE = _SOURCES / "convolution.c"
-_FUNCTIONS = ("jaxil_convolve_relu", "jaxil_kernel_gradient", "jaxil_image_gradient")
+_SOURCE = _SOURCES / "encoder.c"
+_FUNCTIONS = ("jaxil_encode", "jaxil_encode_gradient")
 _COMPILERS = ("gcc", "cc")
 FLAGS = ("-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared")
 _SECONDS = 60.0  # it takes 1
@@ -48,7 +48,7 @@ class BuildError(Exception):
 
 
 def register(library: ctypes.CDLL) -> None:
-    """Tells XLA where the functions are that `maths.convolution` calls."""
+    """Tells XLA where the functions are that `maths.encoding` calls."""
     for name in _FUNCTIONS:
         target = jax.ffi.pycapsule(getattr(library, name))
         jax.ffi.register_ffi_target(name, target, platform="cpu")
@@ -67,7 +67,7 @@ def build(folder: pathlib.Path, flags: tuple[str, ...] = FLAGS) -> pathlib.Path:
     digest = hashlib.sha256(repr(flags).encode())
     for source in (_SOURCE, *sorted(_SOURCES.glob("*.h"))):
         digest.update(source.read_bytes())
-    path = folder / f"convolution-{digest.hexdigest()[:8]}.so"
+    path = folder / f"encoder-{digest.hexdigest()[:8]}.so"
     if path.exists():
         return path
     compiler = os.environ.get("CC") or next(filter(shutil.which, _COMPILERS), None)

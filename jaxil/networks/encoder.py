@@ -7,6 +7,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jax import Array
 
+from jaxil.maths import encoding
 from jaxil.networks.layers import ConvolutionReLU, dense
 
 
@@ -23,7 +24,9 @@ class PixelEncoder(nn.Module):
       mean: what is subtracted, in [0, 1]: 0.5 in the paper, or an image
         [H, W, C] as nested tuples or an array.
       dtype: of the convolutions; parameters are float32 whatever it is.
-      native: see `convolution.convolve_relu`.
+      native: whether `encoding.encode` computes it, which takes float32, channels in
+        multiples of 32 and one derivative. It takes pixels as they are stored; others
+        go the usual way.
 
     Source: facebookresearch/drqv2, drqv2.py, `Encoder`.
     """
@@ -40,15 +43,27 @@ class PixelEncoder(nn.Module):
     def __call__(self, observation: Array) -> Array:
         """Maps uint8 [B, H, W, C] to [B, R] of `dtype`."""
         chex.assert_rank(observation, 4)
-        x = observation.astype(jnp.float32) / 255.0
         mean = jnp.asarray(self.mean, jnp.float32)
-        x = self.contrast * (x - (mean[None] if mean.ndim else mean))
-        layers = zip(self.channels, self.kernel_sizes, self.strides, strict=True)
-        for k, (features, size, stride) in enumerate(layers):
-            layer = ConvolutionReLU(
-                features, size, stride, self.dtype, self.native, name=f"Conv_{k}"
+        settings = zip(self.channels, self.kernel_sizes, self.strides, strict=True)
+        layers = [
+            ConvolutionReLU(*each, self.dtype, name=f"Conv_{k}")
+            for k, each in enumerate(settings)
+        ]
+        if self.native and observation.dtype == jnp.uint8:
+            inputs = (observation.shape[-1], *self.channels)
+            weights = [layer.weights(c) for layer, c in zip(layers, inputs)]
+            x = encoding.encode(
+                observation,
+                mean,
+                weights,
+                contrast=self.contrast,
+                strides=self.strides,
             )
-            x = layer(x)
+        else:
+            x = observation.astype(jnp.float32) / 255.0
+            x = self.contrast * (x - (mean[None] if mean.ndim else mean))
+            for layer in layers:
+                x = layer(x)
         return x.reshape(x.shape[0], -1)
 
 

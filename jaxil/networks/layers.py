@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxil.maths import convolution
+from jaxil.maths.encoding import Weights
 
 _LAYER_NORM_EPSILON = 1e-5  # PyTorch's default; flax's own is 1e-6
 
@@ -36,7 +37,6 @@ class ConvolutionReLU(nn.Module):
       kernel_size: side of the square kernel.
       stride: along both sides.
       dtype: of the convolution; parameters are float32 whatever it is.
-      native: see `convolution.convolve_relu`.
 
     Source: facebookresearch/drqv2, utils.py, `weight_init`.
     """
@@ -45,20 +45,23 @@ class ConvolutionReLU(nn.Module):
     kernel_size: int
     stride: int
     dtype: Any = jnp.float32
-    native: bool = False
 
     @nn.compact
+    def weights(self, channels: int) -> Weights:
+        """Returns the parameters for images of so many channels."""
+        shape = (self.kernel_size, self.kernel_size, channels, self.features)
+        gain = nn.initializers.orthogonal(scale=math.sqrt(2.0))
+        kernel = self.param("kernel", gain, shape)
+        return Weights(
+            kernel, self.param("bias", nn.initializers.zeros, (self.features,))
+        )
+
     def __call__(self, images: Array) -> Array:
         """Maps [B, H, W, C] to [B, H', W', F] of `dtype`."""
         chex.assert_rank(images, 4)
-        shape = (self.kernel_size, self.kernel_size, images.shape[-1], self.features)
-        gain = nn.initializers.orthogonal(scale=math.sqrt(2.0))
-        kernel = self.param("kernel", gain, shape)
-        bias = self.param("bias", nn.initializers.zeros, (self.features,))
-        images, kernel, bias = (x.astype(self.dtype) for x in (images, kernel, bias))
-        return convolution.convolve_relu(
-            images, kernel, bias, self.stride, native=self.native
-        )
+        arrays = (images, *self.weights(images.shape[-1]))
+        images, kernel, bias = (x.astype(self.dtype) for x in arrays)
+        return convolution.convolve_relu(images, kernel, bias, self.stride)
 
 
 class Trunk(nn.Module):

@@ -13,12 +13,10 @@
    The factors are 1 and 1/2, and a sum has 32 terms where it had 288: rounding errors
    are no larger than those of the plain sum. */
 
-#ifndef JAXIL_CONVOLUTION_WINOGRAD_H
-#define JAXIL_CONVOLUTION_WINOGRAD_H
+#ifndef JAXIL_WINOGRAD_H
+#define JAXIL_WINOGRAD_H
 
-#include <string.h>
-
-#include "convolution_blocks.h"
+#include "blocks.h"
 
 #define SIDE 4 /* of a tile of the image; of the output it is 2 */
 #define ELEMENTS (SIDE * SIDE)
@@ -138,32 +136,31 @@ INLINE void transform_tile(const Shape *s, const float *x, Tile tile, float *poi
   }
 }
 
-/* y[i, j, f] = relu((A' sums A)[i, j] + bias) of one tile; without bias no relu. */
+/* y[i, j, f] = (A' sums A)[i, j] of one tile, finished. */
 INLINE void finish_tile(const Shape *s, const float *sums, size_t step, Tile tile,
-                        const float *bias, float *y) {
-  float *to = y + (tile.i * s->out_width + tile.j) * s->features;
+                        const Finish *finish, Points y) {
   for (size_t f = 0; f < s->features; f += LANES) {
     Vector d[SIDE][SIDE], e[2][SIDE];
     UNROLL for (size_t k = 0; k < ELEMENTS; k++)
         d[k / SIDE][k % SIDE] = *(const Vector *)(sums + k * step + f);
     TRANSFORM(output_transform, SIDE, 2, d, e);
     UNROLL for (size_t k = 0; k < 4; k++) {
-      const Vector z = e[k / 2][k % 2];
-      *(Vector *)(to + (k / 2 * s->out_width + k % 2) * s->features + f) =
-          bias ? relu(z + *(const Vector *)(bias + f)) : z;
+      const size_t i = tile.i + k / 2, j = tile.j + k % 2;
+      *(Vector *)(y.at + i * y.row + j * y.step + f) =
+          finished(e[k / 2][k % 2], finish, i * s->out_width + j, f, s->features);
     }
   }
 }
 
 /* points[element, f] = (A dY A')[element] of one tile. */
-INLINE void transform_cotangent(const Shape *s, const float *g, Tile tile,
-                                float *points, size_t step) {
-  const float *from = g + (tile.i * s->out_width + tile.j) * s->features;
+INLINE void transform_cotangent(const Shape *s, Points g, Tile tile, float *points,
+                                size_t step) {
+  const float *from = g.at + tile.i * g.row + tile.j * g.step;
   for (size_t f = 0; f < s->features; f += LANES) {
     Vector d[2][SIDE], e[SIDE][SIDE];
     UNROLL for (size_t k = 0; k < 4; k++) {
       const int again = k / 2 < tile.i_again || k % 2 < tile.j_again;
-      const float *at = from + (k / 2 * s->out_width + k % 2) * s->features + f;
+      const float *at = from + k / 2 * g.row + k % 2 * g.step + f;
       d[k / 2][k % 2] = again ? (Vector){0} : *(const Vector *)at;
     }
     TRANSFORM(cotangent_transform, 2, SIDE, d, e);
@@ -186,13 +183,23 @@ static size_t winograd_convolve_scratch(const Shape *s) {
   return ELEMENTS * BLOCK * (s->channels + s->features);
 }
 
-/* y = relu(x * k + bias) of one image, u being the transformed kernel; without bias
-   y = x * k. */
+/* sums[p, f] of one element: points [n, channels] times w [channels, features]. */
+INLINE void multiply_points(size_t n, const Shape *s, const float *points,
+                            const float *w, float *sums) {
+  Vector low[BLOCK], high[BLOCK];
+  sum_points(n, points, s->channels, 0, 1, s->channels, w, s->features, low, high);
+  UNROLL for (size_t p = 0; p < n; p++) {
+    *(Vector *)(sums + p * s->features) = low[p];
+    *(Vector *)(sums + p * s->features + LANES) = high[p];
+  }
+}
+
+/* y = x * k of one image, finished; u is the transformed kernel. */
 static void winograd_convolve(const Shape *s, const float *x, const float *u,
-                              const float *bias, float *y, float *scratch) {
+                              const Finish *finish, Points y, float *scratch) {
   const size_t tiles = count_tiles(s), blocks = (tiles + BLOCK - 1) / BLOCK;
   const size_t step = BLOCK * s->channels, sums_step = BLOCK * s->features;
-  const size_t row = s->width * s->channels, y_row = s->out_width * s->features;
+  const size_t row = s->width * s->channels, pairs = s->channels * s->features;
   float *sums = scratch + ELEMENTS * step;
   for (size_t q = 0; q < blocks; q++) {
     const size_t t = tiles * q / blocks, n = tiles * (q + 1) / blocks - t;
@@ -201,18 +208,18 @@ static void winograd_convolve(const Shape *s, const float *x, const float *u,
     for (size_t e = 0; e < ELEMENTS; e++) {
       const size_t part = (q + 1) * ELEMENTS + e, parts = blocks * ELEMENTS;
       prefetch(x + SIDE * row, s->height * row, part, parts);
-      prefetch(y + y_row, s->out_height * y_row, part, parts);
+      prefetch(y.at + y.row, s->out_height * y.row, part, parts);
       for (size_t f = 0; f < s->features; f += PAIR)
-        WITH_KNOWN(n, convolve_points, scratch + e * step, s->channels, 0, 1,
-                   s->channels, u + e * s->channels * s->features + f, NULL,
-                   sums + e * sums_step + f, s->features)
+        WITH_KNOWN(n, multiply_points, s, scratch + e * step, u + e * pairs + f,
+                   sums + e * sums_step + f)
     }
     for (size_t p = 0; p < n; p++)
-      finish_tile(s, sums + p * s->features, sums_step, tile_at(s, t + p), bias, y);
+      finish_tile(s, sums + p * s->features, sums_step, tile_at(s, t + p), finish, y);
   }
 }
 
-/* So many tiles stay in a core's own cache, and each sum is loaded once for them. */
+/* So many tiles stay in a core's own cache, and each sum is loaded once for them. No
+   power of two: elements would lie in the same lines of the cache. */
 #define TILES 60
 
 static size_t winograd_correlate_scratch(const Shape *s) {
@@ -221,7 +228,7 @@ static size_t winograd_correlate_scratch(const Shape *s) {
 
 /* u[element, c, f] += what one image and the cotangent g of its output mean for the
    transformed kernel. */
-static void winograd_correlate(const Shape *s, const float *x, const float *g, float *u,
+static void winograd_correlate(const Shape *s, const float *x, Points g, float *u,
                                float *scratch) {
   const size_t tiles = count_tiles(s), parts = (tiles + TILES - 1) / TILES;
   const size_t step = TILES * s->channels, g_step = TILES * s->features;
@@ -241,10 +248,11 @@ static void winograd_correlate(const Shape *s, const float *x, const float *g, f
         const size_t m = s->channels * (b + 1) / blocks - c;
         prefetch(x + SIDE * row, s->height * row, ((q + 1) * ELEMENTS + e) * blocks + b,
                  parts * ELEMENTS * blocks);
-        for (size_t f = 0; f < s->features; f += PAIR)
+        for (size_t f = 0; f < s->features; f += PAIR) {
+          const Points pair = {cotangents + e * g_step + f, 0, s->features};
           WITH_KNOWN(m, correlate_points, scratch + e * step + c, s->channels, 0, 1, n,
-                     cotangents + e * g_step + f,
-                     u + (e * s->channels + c) * s->features + f, s->features)
+                     pair, u + (e * s->channels + c) * s->features + f, s->features)
+        }
       }
   }
 }

@@ -1,0 +1,368 @@
+/* An encoder's convolutions with ReLU, and their gradients, for XLA on a CPU.
+
+   `encoding.py` says what each function computes; shapes and names are its own. Arrays
+   are channels last, and VALID: every window lies in its image. A thread takes an image
+   through all layers, so that what lies between them stays in its cache.
+
+   This file is XLA's side: buffers in, buffers out, a batch shared out to threads. What
+   is done with an image is in the headers. */
+
+#include <sched.h>
+#include <stdatomic.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "layers.h"
+#include "xla/ffi/api/c_api.h"
+
+#define MOST_LAYERS 8
+
+typedef struct {
+  size_t batch, count; /* images, layers */
+  Layer layers[MOST_LAYERS];
+  const uint8_t *pixels;
+  const float *mean;
+  size_t mean_size; /* 1, or that of an image */
+  float contrast;
+  float *y[MOST_LAYERS];              /* outputs of the layers; NULL: not wanted */
+  const float *cotangent;             /* of the last one */
+  float *sums;                        /* of gradients, one after the other */
+  size_t num_sums, sum_size;          /* how many, and numbers in one */
+  size_t gradients[MOST_LAYERS];      /* where the gradients of a layer begin in it */
+  float *kernels;                     /* what `prepare` has allocated */
+  atomic_int out_of_memory;
+} Call;
+
+typedef void Work(Call *call, size_t part);
+
+/* Parts of a batch that are handed out one by one. The last of its users frees it. */
+typedef struct {
+  Work *work;
+  Call *call;
+  size_t count;
+  atomic_size_t next, done, users;
+} Team;
+
+static void leave(Team *team) {
+  if (atomic_fetch_sub(&team->users, 1) == 1) free(team);
+}
+
+static void take_part(void *data) {
+  Team *team = data;
+  size_t part;
+  while ((part = atomic_fetch_add(&team->next, 1)) < team->count) {
+    team->work(team->call, part);
+    atomic_fetch_add(&team->done, 1);
+  }
+  leave(team);
+}
+
+static int succeeded(XLA_FFI_CallFrame *frame, XLA_FFI_Error *error) {
+  if (error == NULL) return 1;
+  XLA_FFI_Error_Destroy_Args args = {
+      .struct_size = XLA_FFI_Error_Destroy_Args_STRUCT_SIZE,
+      .error = error,
+  };
+  frame->api->XLA_FFI_Error_Destroy(&args);
+  return 0;
+}
+
+/* Returns how many threads XLA has; 1 where it doesn't tell. */
+static size_t number_of_threads(XLA_FFI_CallFrame *frame) {
+  int64_t threads = 1;
+  XLA_FFI_ThreadPool_NumThreads_Args args = {
+      .struct_size = XLA_FFI_ThreadPool_NumThreads_Args_STRUCT_SIZE,
+      .ctx = frame->ctx,
+      .num_threads = &threads,
+  };
+  const int known = succeeded(frame, frame->api->XLA_FFI_ThreadPool_NumThreads(&args));
+  return known && threads > 1 ? (size_t)threads : 1;
+}
+
+/* Works on all parts, with the threads of XLA that are free. A thread that comes too
+   late finds none left; so only parts in work are waited for, and that always ends. */
+static void for_each(size_t count, XLA_FFI_CallFrame *frame, Work *work, Call *call) {
+  const size_t threads = number_of_threads(frame);
+  const size_t members = threads < count ? threads : count;
+  Team *team = members > 1 ? malloc(sizeof(Team)) : NULL;
+  if (team == NULL) {
+    for (size_t part = 0; part < count; part++) work(call, part);
+    return;
+  }
+  *team = (Team){.work = work, .call = call, .count = count};
+  atomic_init(&team->users, members + 1); /* once more, for the one who waits */
+  for (size_t k = 1; k < members; k++) {
+    XLA_FFI_ThreadPool_Schedule_Args task = {
+        .struct_size = XLA_FFI_ThreadPool_Schedule_Args_STRUCT_SIZE,
+        .ctx = frame->ctx,
+        .task = take_part,
+        .data = team,
+    };
+    if (!succeeded(frame, frame->api->XLA_FFI_ThreadPool_Schedule(&task))) leave(team);
+  }
+  take_part(team);
+  while (atomic_load(&team->done) < count) sched_yield();
+  leave(team);
+}
+
+static XLA_FFI_Error *no_memory(XLA_FFI_CallFrame *frame) {
+  XLA_FFI_Error_Create_Args error = {
+      .struct_size = XLA_FFI_Error_Create_Args_STRUCT_SIZE,
+      .message = "no memory for an encoder's convolutions",
+      .errc = XLA_FFI_Error_Code_RESOURCE_EXHAUSTED,
+  };
+  return frame->api->XLA_FFI_Error_Create(&error);
+}
+
+/* Says which interface this was compiled for, where XLA asks for no more than that. */
+static int answers_metadata(XLA_FFI_CallFrame *frame) {
+  /* Its type has another name in jaxlib 0.10 than in 0.12. */
+  const void *extension = frame->extension_start;
+  if (extension == NULL || frame->extension_start->type != XLA_FFI_Extension_Metadata)
+    return 0;
+  XLA_FFI_Metadata *metadata = ((const XLA_FFI_Metadata_Extension *)extension)->metadata;
+  metadata->api_version.major_version = XLA_FFI_API_MAJOR;
+  metadata->api_version.minor_version = XLA_FFI_API_MINOR;
+  return 1;
+}
+
+static const XLA_FFI_Buffer *argument(XLA_FFI_CallFrame *frame, int k) {
+  return frame->args.args[k];
+}
+
+static const XLA_FFI_Buffer *result(XLA_FFI_CallFrame *frame, int k) {
+  return frame->rets.rets[k];
+}
+
+/* Reads the call: pixels, mean, then kernel and bias of each layer; the contrast and
+   the strides. */
+static Call read_call(XLA_FFI_CallFrame *frame, size_t layers) {
+  const XLA_FFI_Buffer *pixels = argument(frame, 0), *mean = argument(frame, 1);
+  const XLA_FFI_Scalar *contrast = frame->attrs.attrs[0]; /* in the names' order */
+  const XLA_FFI_Array *strides = frame->attrs.attrs[1];
+  Call call = {
+      .batch = pixels->dims[0],
+      .count = layers,
+      .pixels = pixels->data,
+      .mean = mean->data,
+      .mean_size = 1,
+      .contrast = *(const float *)contrast->value,
+  };
+  for (int64_t k = 0; k < mean->rank; k++) call.mean_size *= mean->dims[k];
+  size_t height = pixels->dims[1], width = pixels->dims[2];
+  for (size_t l = 0; l < layers; l++) {
+    const XLA_FFI_Buffer *kernel = argument(frame, 2 + 2 * l);
+    const size_t stride = ((const int64_t *)strides->data)[l];
+    const size_t down = kernel->dims[0], right = kernel->dims[1];
+    const Shape shape = {
+        .height = height,
+        .width = width,
+        .channels = kernel->dims[2],
+        .kernel_height = down,
+        .kernel_width = right,
+        .features = kernel->dims[3],
+        .stride = stride,
+        .out_height = (height - down) / stride + 1,
+        .out_width = (width - right) / stride + 1,
+    };
+    call.layers[l] = make_layer(shape);
+    call.layers[l].kernel = kernel->data;
+    call.layers[l].bias = argument(frame, 3 + 2 * l)->data;
+    height = shape.out_height;
+    width = shape.out_width;
+  }
+  return call;
+}
+
+/* Allocates and fills the kernels that are not used as they are. For the way back all
+   layers but the first have one that is turned around. */
+static int prepare(Call *call, int backward) {
+  size_t size = 0;
+  for (size_t l = 0; l < call->count; l++) {
+    const Layer *layer = &call->layers[l];
+    size += kernel_size(&layer->shape, layer->winograd);
+    size += kernel_size(&layer->back, 0) + kernel_size(&layer->back, 1);
+  }
+  float *next = call->kernels = malloc(size * sizeof(float));
+  if (next == NULL) return 0;
+  for (size_t l = 0; l < call->count; l++) {
+    Layer *layer = &call->layers[l];
+    const float *kernel = layer->kernel;
+    if (!backward && layer->winograd) {
+      transform_kernel(&layer->shape, kernel, next);
+      layer->kernel = next;
+      next += kernel_size(&layer->shape, 1);
+    }
+    if (backward && l > 0) {
+      turn_kernel(&layer->shape, kernel, next);
+      layer->turned = next;
+      next += kernel_size(&layer->back, 0);
+      if (layer->back_winograd) {
+        transform_kernel(&layer->back, layer->turned, next);
+        layer->turned = next;
+        next += kernel_size(&layer->back, 1);
+      }
+    }
+  }
+  return 1;
+}
+
+/* Memory for one part of a batch; NULL, and the call fails, if there is none. */
+static float *scratch_for(Call *call, size_t size) {
+  float *scratch = malloc(size * sizeof(float));
+  if (scratch == NULL) atomic_store(&call->out_of_memory, 1);
+  return scratch;
+}
+
+/* x = contrast (pixels / 255 - mean) of one image. */
+static void centre(const Call *call, size_t image, float *x) {
+  const size_t size = image_size(&call->layers[0].shape);
+  const uint8_t *pixels = call->pixels + image * size;
+  if (call->mean_size == 1) {
+    const float mean = *call->mean;
+    for (size_t k = 0; k < size; k++)
+      x[k] = call->contrast * (pixels[k] / 255.0f - mean);
+  } else {
+    for (size_t k = 0; k < size; k++)
+      x[k] = call->contrast * (pixels[k] / 255.0f - call->mean[k]);
+  }
+}
+
+static void encode_image(Call *call, size_t image) {
+  const Layer *layers = call->layers;
+  size_t most = 0, scratch_size = 0;
+  for (size_t l = 0; l < call->count; l++) {
+    most = larger(most, output_size(&layers[l].shape));
+    scratch_size = larger(scratch_size, forward_scratch(&layers[l]));
+  }
+  const size_t pixels = image_size(&layers[0].shape);
+  float *x = scratch_for(call, pixels + 2 * most + scratch_size);
+  if (x == NULL) return;
+  float *between[] = {x + pixels, x + pixels + most}, *scratch = between[1] + most;
+  centre(call, image, x);
+  const float *from = x;
+  for (size_t l = 0; l < call->count; l++) {
+    float *y = call->y[l] ? call->y[l] + image * output_size(&layers[l].shape)
+                          : between[l % 2];
+    go_forward(&layers[l], from, y, scratch);
+    from = y;
+  }
+  free(x);
+}
+
+/* pixels, mean, (kernel, bias) of each layer -> y of each layer, or of the last one */
+XLA_FFI_Error *jaxil_encode(XLA_FFI_CallFrame *frame) {
+  if (answers_metadata(frame)) return NULL;
+  Call call = read_call(frame, (frame->args.size - 2) / 2);
+  const size_t wanted = frame->rets.size, first = call.count - wanted;
+  for (size_t l = first; l < call.count; l++) call.y[l] = result(frame, l - first)->data;
+  if (!prepare(&call, 0)) return no_memory(frame);
+  for_each(call.batch, frame, encode_image, &call);
+  free(call.kernels);
+  return atomic_load(&call.out_of_memory) ? no_memory(frame) : NULL;
+}
+
+/* So many images have one sum of their gradients. It is a constant, and the sums are
+   added up in order: the result doesn't depend on the number of threads. */
+#define IMAGES_OF_A_SUM 4
+
+/* Numbers in the array for the cotangent of layer l. The first has no frame: nobody
+   asks for the gradient of pixels. */
+static size_t cotangent_size(const Layer *layer, size_t l) {
+  return l ? image_size(&layer->back) : output_size(&layer->shape);
+}
+
+static Points place_cotangent(const Layer *layer, size_t l, float *array) {
+  if (l == 0) return one_after_the_other(&layer->shape, array);
+  memset(array, 0, cotangent_size(layer, l) * sizeof(float));
+  return in_frame(layer, array);
+}
+
+static void differentiate_images(Call *call, size_t part) {
+  const Layer *layers = call->layers;
+  size_t most = 0, scratch_size = 0;
+  for (size_t l = 0; l < call->count; l++) {
+    most = larger(most, cotangent_size(&layers[l], l));
+    scratch_size = larger(scratch_size, backward_scratch(&layers[l]));
+  }
+  const size_t pixels = image_size(&layers[0].shape);
+  float *x = scratch_for(call, pixels + 2 * most + scratch_size);
+  if (x == NULL) return;
+  float *frames[] = {x + pixels, x + pixels + most}, *scratch = frames[1] + most;
+  float *sums = call->sums + part * call->sum_size;
+  memset(sums, 0, call->sum_size * sizeof(float));
+  const size_t last = call->count - 1, size = output_size(&layers[last].shape);
+  const size_t first = part * IMAGES_OF_A_SUM, end = first + IMAGES_OF_A_SUM;
+  for (size_t image = first; image < end && image < call->batch; image++) {
+    centre(call, image, x);
+    float *frame = frames[last % 2];
+    Points g = place_cotangent(&layers[last], last, frame);
+    pass_relu(&layers[last].shape, call->y[last] + image * size,
+              call->cotangent + image * size, g);
+    for (size_t l = last;; l--) {
+      const Layer *layer = &layers[l];
+      const float *from = l ? call->y[l - 1] + image * image_size(&layer->shape) : x;
+      float *kernel = sums + call->gradients[l];
+      float *bias = kernel + kernel_size(&layer->shape, layer->winograd);
+      add_gradients(layer, from, g, kernel, bias, scratch);
+      if (l == 0) break;
+      float *next = frames[(l - 1) % 2];
+      g = place_cotangent(&layers[l - 1], l - 1, next);
+      go_backward(layer, frame, from, g, scratch);
+      frame = next;
+    }
+  }
+  free(x);
+}
+
+#define NUMBERS_OF_A_SLICE 4096
+
+static void add_up_slice(Call *call, size_t slice) {
+  const size_t first = slice * NUMBERS_OF_A_SLICE;
+  size_t end = first + NUMBERS_OF_A_SLICE;
+  if (end > call->sum_size) end = call->sum_size;
+  for (size_t sum = 1; sum < call->num_sums; sum++) {
+    const float *addend = call->sums + sum * call->sum_size;
+    for (size_t k = first; k < end; k++) call->sums[k] += addend[k];
+  }
+}
+
+/* pixels, mean, (kernel, bias) of each layer, y of each layer, cotangent of the last
+   -> gradients of (kernel, bias) of each layer */
+XLA_FFI_Error *jaxil_encode_gradient(XLA_FFI_CallFrame *frame) {
+  if (answers_metadata(frame)) return NULL;
+  Call call = read_call(frame, (frame->args.size - 3) / 3);
+  for (size_t l = 0; l < call.count; l++) {
+    const Layer *layer = &call.layers[l];
+    call.y[l] = argument(frame, 2 + 2 * call.count + l)->data;
+    call.gradients[l] = call.sum_size;
+    call.sum_size += kernel_size(&layer->shape, layer->winograd);
+    call.sum_size += layer->shape.features;
+  }
+  call.cotangent = argument(frame, 2 + 3 * call.count)->data;
+  call.num_sums = (call.batch + IMAGES_OF_A_SUM - 1) / IMAGES_OF_A_SUM;
+  call.sums = malloc(call.num_sums * call.sum_size * sizeof(float));
+  if (call.sums == NULL || !prepare(&call, 1)) {
+    free(call.sums);
+    return no_memory(frame);
+  }
+  for_each(call.num_sums, frame, differentiate_images, &call);
+  const size_t slices = (call.sum_size + NUMBERS_OF_A_SLICE - 1) / NUMBERS_OF_A_SLICE;
+  for_each(slices, frame, add_up_slice, &call);
+  for (size_t l = 0; l < call.count; l++) {
+    const Layer *layer = &call.layers[l];
+    const Shape *s = &layer->shape;
+    const float *sum = call.sums + call.gradients[l];
+    float *kernel = result(frame, 2 * l)->data;
+    if (layer->winograd)
+      transform_gradient(s, sum, kernel);
+    else
+      memcpy(kernel, sum, kernel_size(s, 0) * sizeof(float));
+    memcpy(result(frame, 2 * l + 1)->data, sum + kernel_size(s, layer->winograd),
+           s->features * sizeof(float));
+  }
+  free(call.kernels);
+  free(call.sums);
+  return atomic_load(&call.out_of_memory) ? no_memory(frame) : NULL;
+}

@@ -1,0 +1,161 @@
+"""An encoder's convolutions in C: all layers of an image at once, for CPUs."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+# By two vectors of a processor it takes features; no CPU's vectors are longer.
+FEATURES = 32
+MOST_LAYERS = 8
+
+
+class Weights(NamedTuple):
+    """Of one layer.
+
+    Attributes:
+      kernel: float32 [h, w, C, F], F a multiple of FEATURES.
+      bias: float32 [F].
+    """
+
+    kernel: Array
+    bias: Array
+
+
+def encode(
+    pixels: Array,
+    mean: Array,
+    weights: Sequence[Weights],
+    *,
+    contrast: float,
+    strides: tuple[int, ...],
+) -> Array:
+    """Passes pixels through VALID convolutions with ReLU.
+
+        x_0 = contrast (pixels / 255 - mean)
+        x_l[i, j, f] = max(0, b[f] + sum_{u,v,c} x_{l-1}[s i + u, s j + v, c] k[u, v, c, f])
+
+    `jaxil.native` has to be loaded. It can be differentiated once, for the weights;
+    pixels and mean have no gradient. Kernels of 3x3 without stride take another way,
+    see `winograd.h`: it rounds otherwise, and what is not finite spreads by a pixel.
+
+    Args:
+      pixels: uint8 [B, H, W, C].
+      mean: float32 [H, W, C], or of one number, any rank.
+      weights: of each layer, at most MOST_LAYERS.
+      contrast: factor on the centred pixels.
+      strides: s of each layer, along both sides.
+
+    Returns:
+      The last layer's output, float32 [B, H', W', F].
+    """
+    chex.assert_rank(pixels, 4)
+    chex.assert_type([pixels, mean], [jnp.uint8, jnp.float32])
+    chex.assert_equal(len(weights), len(strides))
+    assert mean.size == 1 or mean.shape == pixels.shape[1:], mean.shape
+    assert 1 <= len(weights) <= MOST_LAYERS, len(weights)
+    channels = pixels.shape[3]
+    for kernel, bias in weights:
+        chex.assert_shape([kernel, bias], [(None, None, channels, None), (None,)])
+        chex.assert_equal(kernel.shape[3], bias.shape[0])
+        channels = kernel.shape[3]
+        assert channels % FEATURES == 0, channels
+    return _ENCODE(contrast, strides, pixels, mean, tuple(weights))
+
+
+def _encode(
+    contrast: float,
+    strides: tuple[int, ...],
+    pixels: Array,
+    mean: Array,
+    weights: tuple[Weights, ...],
+) -> Array:
+    (y,) = _forward(contrast, strides, pixels, mean, weights, wanted=1)
+    return y
+
+
+def _forward(
+    contrast: float,
+    strides: tuple[int, ...],
+    pixels: Array,
+    mean: Array,
+    weights: tuple[Weights, ...],
+    *,
+    wanted: int,
+) -> list[Array]:
+    """Returns the outputs of the last layers, as many as are wanted."""
+    size, shapes = pixels.shape[1:3], []
+    for (kernel, _), stride in zip(weights, strides, strict=True):
+        size = tuple((n - k) // stride + 1 for n, k in zip(size, kernel.shape))
+        shapes.append(_array(pixels.shape[0], *size, kernel.shape[3]))
+    return _call(
+        "jaxil_encode", shapes[-wanted:], contrast, strides, pixels, mean, *weights
+    )
+
+
+class _Saved(NamedTuple):
+    """What the gradients need; an output tells where ReLU let pass."""
+
+    pixels: Array
+    mean: Array
+    weights: tuple[Weights, ...]
+    outputs: list[Array]
+
+
+def _encode_forward(
+    contrast: float,
+    strides: tuple[int, ...],
+    pixels: Array,
+    mean: Array,
+    weights: tuple[Weights, ...],
+) -> tuple[Array, _Saved]:
+    outputs = _forward(contrast, strides, pixels, mean, weights, wanted=len(weights))
+    return outputs[-1], _Saved(pixels, mean, weights, outputs)
+
+
+def _encode_backward(
+    contrast: float, strides: tuple[int, ...], saved: _Saved, cotangent: Array
+) -> tuple[None, None, tuple[Weights, ...]]:
+    pixels, mean, weights, outputs = saved
+    shapes = [_array(*leaf.shape) for leaf in jax.tree.leaves(weights)]
+    gradients = _call(
+        "jaxil_encode_gradient",
+        shapes,
+        contrast,
+        strides,
+        pixels,
+        mean,
+        *weights,
+        *outputs,
+        cotangent,
+    )
+    of_layers = zip(gradients[::2], gradients[1::2], strict=True)
+    return None, None, tuple(Weights(*layer) for layer in of_layers)
+
+
+_ENCODE: Any = jax.custom_vjp(_encode, nondiff_argnums=(0, 1))
+_ENCODE.defvjp(_encode_forward, _encode_backward)
+
+
+def _array(*shape: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(shape, jnp.float32)
+
+
+def _call(
+    name: str,
+    results: list[jax.ShapeDtypeStruct],
+    contrast: float,
+    strides: tuple[int, ...],
+    *arguments: Any,
+) -> list[Array]:
+    """Calls a function of encoder.c."""
+    call = jax.ffi.ffi_call(name, results, vmap_method="sequential")
+    return call(
+        *jax.tree.leaves(arguments),
+        contrast=np.float32(contrast),
+        strides=np.asarray(strides, np.int64),
+    )
