@@ -65,10 +65,9 @@ def random_shift(images: Array, key: Array, *, padding: int) -> Array:
     shifts = corners - padding
     rows = jnp.clip(jnp.arange(height)[None] + shifts[:, :1], 0, height - 1)
     columns = jnp.clip(jnp.arange(width)[None] + shifts[:, 1:], 0, width - 1)
-    # Whole rows first, of all images laid end to end: they lie in one piece.
-    places = (jnp.arange(batch)[:, None] * height + rows).reshape(-1)
-    laid_out = jnp.asarray(images).reshape(batch * height, -1)
-    moved = laid_out.at[places].get(mode="promise_in_bounds").reshape(images.shape)
-    return jax.vmap(
-        lambda image, column: image.at[:, column].get(mode="promise_in_bounds")
-    )(moved, columns)
+    places = (
+        jnp.arange(batch)[:, None, None],
+        rows[:, :, None],
+        columns[:, None, :],
+    )
+    return jnp.asarray(images).at[places].get(mode="promise_in_bounds")

@@ -200,7 +200,10 @@ static void winograd_convolve(const Shape *s, const float *x, const float *u,
   const size_t tiles = count_tiles(s), blocks = (tiles + BLOCK - 1) / BLOCK;
   const size_t step = BLOCK * s->channels, sums_step = BLOCK * s->features;
   const size_t row = s->width * s->channels, pairs = s->channels * s->features;
-  float *sums = scratch + ELEMENTS * step;
+  /* One pair of features has been read when its sums are written: then in the same
+     place, which halves what the cache has to hold. */
+  const int in_place = s->features == PAIR && s->channels == PAIR;
+  float *sums = in_place ? scratch : scratch + ELEMENTS * step;
   for (size_t q = 0; q < blocks; q++) {
     const size_t t = tiles * q / blocks, n = tiles * (q + 1) / blocks - t;
     for (size_t p = 0; p < n; p++)

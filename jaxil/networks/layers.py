@@ -8,7 +8,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jax import Array
 
-from jaxil.maths import convolution
+from jaxil.maths import convolution, products
 from jaxil.maths.encoding import Weights
 
 _LAYER_NORM_EPSILON = 1e-5  # PyTorch's default; flax's own is 1e-6
@@ -25,7 +25,11 @@ def dense(features: int, name: str | None = None, dtype: Any = jnp.float32) -> n
     Source: facebookresearch/drqv2, utils.py, `weight_init`.
     """
     return nn.Dense(
-        features, kernel_init=nn.initializers.orthogonal(), name=name, dtype=dtype
+        features,
+        kernel_init=nn.initializers.orthogonal(),
+        name=name,
+        dtype=dtype,
+        dot_general=products.dot_general,
     )
 
 

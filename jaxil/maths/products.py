@@ -1,0 +1,87 @@
+"""The product of dense layers, with gradients in a form that XLA's CPU does fast.
+
+XLA hands matrices to Eigen as they lie. A product that walks through one of them across
+its rows takes twice as long, on one core: 256x1024 with a transposed 1024x1024 5.6 ms,
+not 2.2, and a gradient of 39200x50 10.6, not 5.3. So the operands change places here;
+barriers keep XLA from changing them back. On other devices it costs small copies.
+"""
+
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+# A kernel so many times longer than wide is walked through the other way.
+_SLENDER = 16
+
+
+def product(x: Array, kernel: Array) -> Array:
+    """Returns x W. It can be differentiated any number of times.
+
+    Args:
+      x: shape [B, R].
+      kernel: W, shape [R, F].
+
+    Returns:
+      Shape [B, F].
+    """
+    chex.assert_rank([x, kernel], 2)
+    return _PRODUCT(x, kernel)
+
+
+def dot_general(x: Array, kernel: Array, *_: Any, **__: Any) -> Array:
+    """Is `product`, as `flax.linen.Dense` calls it."""
+    return product(x, kernel)
+
+
+def _is_slender(kernel: Array) -> bool:
+    return kernel.shape[0] >= _SLENDER * kernel.shape[1]
+
+
+def _product(x: Array, kernel: Array) -> Array:
+    return jnp.matmul(x, kernel)
+
+
+def _transposed_product(y: Array, kernel: Array) -> Array:
+    """Returns y W'."""
+    if _is_slender(kernel):
+        return jnp.matmul(y, kernel.T)
+    barrier = lax.optimization_barrier
+    return barrier(jnp.matmul(kernel, barrier(y.T))).T
+
+
+def _outer_product(x: Array, y: Array) -> Array:
+    """Returns x' y, which is a kernel's gradient."""
+    if x.shape[1] >= _SLENDER * y.shape[1]:
+        return lax.optimization_barrier(jnp.matmul(y.T, x)).T
+    return jnp.matmul(x.T, y)
+
+
+def _forward(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
+    return _product(x, kernel), (x, kernel)
+
+
+def _backward(saved: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
+    x, kernel = saved
+    return _TRANSPOSED(cotangent, kernel), _outer_product(x, cotangent)
+
+
+def _transposed_forward(
+    y: Array, kernel: Array
+) -> tuple[Array, tuple[Array, Array]]:
+    return _transposed_product(y, kernel), (y, kernel)
+
+
+def _transposed_backward(
+    saved: tuple[Array, Array], cotangent: Array
+) -> tuple[Array, Array]:
+    y, kernel = saved
+    return _PRODUCT(cotangent, kernel), _outer_product(cotangent, y)
+
+
+_PRODUCT: Any = jax.custom_vjp(_product)
+_PRODUCT.defvjp(_forward, _backward)
+_TRANSPOSED: Any = jax.custom_vjp(_transposed_product)
+_TRANSPOSED.defvjp(_transposed_forward, _transposed_backward)
