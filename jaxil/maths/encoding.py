@@ -37,7 +37,8 @@ def encode(
     """Passes pixels through VALID convolutions with ReLU.
 
         x_0 = contrast (pixels / 255 - mean)
-        x_l[i, j, f] = max(0, b[f] + sum_{u,v,c} x_{l-1}[s i + u, s j + v, c] k[u, v, c, f])
+        x_l[i, j, f] = max(0, z[i, j, f])
+        z[i, j, f] = b[f] + sum_{u,v,c} x_{l-1}[s i + u, s j + v, c] k[u, v, c, f]
 
     `jaxil.native` has to be loaded. It can be differentiated once, for the weights;
     pixels and mean have no gradient. Kernels of 3x3 without stride take another way,
@@ -86,10 +87,11 @@ def _forward(
     weights: tuple[Weights, ...],
     *,
     wanted: int,
-) -> list[Array]:
+) -> Sequence[Array]:
     """Returns the outputs of the last layers, as many as are wanted."""
     size, shapes = pixels.shape[1:3], []
     for (kernel, _), stride in zip(weights, strides, strict=True):
+        assert all(n >= k for n, k in zip(size, kernel.shape)), (size, kernel.shape)
         size = tuple((n - k) // stride + 1 for n, k in zip(size, kernel.shape))
         shapes.append(_array(pixels.shape[0], *size, kernel.shape[3]))
     return _call(
@@ -103,7 +105,7 @@ class _Saved(NamedTuple):
     pixels: Array
     mean: Array
     weights: tuple[Weights, ...]
-    outputs: list[Array]
+    outputs: Sequence[Array]
 
 
 def _encode_forward(
@@ -151,7 +153,7 @@ def _call(
     contrast: float,
     strides: tuple[int, ...],
     *arguments: Any,
-) -> list[Array]:
+) -> Sequence[Array]:
     """Calls a function of encoder.c."""
     call = jax.ffi.ffi_call(name, results, vmap_method="sequential")
     return call(

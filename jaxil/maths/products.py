@@ -68,9 +68,7 @@ def _backward(saved: tuple[Array, Array], cotangent: Array) -> tuple[Array, Arra
     return _TRANSPOSED(cotangent, kernel), _outer_product(x, cotangent)
 
 
-def _transposed_forward(
-    y: Array, kernel: Array
-) -> tuple[Array, tuple[Array, Array]]:
+def _transposed_forward(y: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
     return _transposed_product(y, kernel), (y, kernel)
 
 
