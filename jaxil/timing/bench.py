@@ -25,7 +25,18 @@ _DRAWN_FRAMES = 20  # of a made-up episode; 500 take longer than all else here
 
 
 class _LoopOnly(train.Run):
-    """A run whose loop neither evaluates nor saves: both are timed by themselves."""
+    """A run whose loop neither evaluates nor saves: both are timed by themselves.
+
+    Attributes:
+      waits: whether the environment waits for each update.
+    """
+
+    waits = False
+
+    def update(self) -> None:
+        super().update()
+        if self.waits:
+            jax.block_until_ready(self.state.num_updates)
 
     def begin_episode(self, episode: int) -> bool:
         # Its budget is a few decisions, less than an episode has.
@@ -49,7 +60,7 @@ class Bench:
       first_update_seconds: its compilation included.
     """
 
-    run: train.Run
+    run: _LoopOnly
     episode: FinishedEpisode
     batches: tuple[Batch | None, ExpertBatch | None]
     first_update_seconds: float
@@ -93,6 +104,23 @@ class Bench:
         if times == 1:
             return self.batches
         return jax.tree.map(lambda leaf: np.stack([leaf] * times), self.batches)
+
+    def loop(self, steps: int, *, waits: bool) -> float:
+        """Acts and learns for so many decisions; returns seconds.
+
+        Args:
+          steps: of all environments together.
+          waits: whether environments stand still while the learner updates.
+        """
+        run = self.run
+        run.waits = waits
+        with run.config.unlocked():
+            run.config.total_frames = run.frame + steps * run.config.action_repeat
+        begin = time.perf_counter()
+        run.loop(whole_episodes=False)
+        # The last update may still run in the background: it is an update's time.
+        run.stopwatch.timed("update", jax.block_until_ready)(run.state.num_updates)
+        return time.perf_counter() - begin
 
     def update_parts(self) -> dict[str, Callable[[], Any]]:
         """Returns the parts of an update; see `make_parts`."""
@@ -159,7 +187,6 @@ def make_bench(
     folder: pathlib.Path,
     demonstrations: Any,
     *,
-    steps: int,
     say: Callable[[str], None],
 ) -> Bench:
     """Returns a run that has stored an episode and updated once.
@@ -168,7 +195,6 @@ def make_bench(
       config: checked.
       folder: of the run.
       demonstrations: of the config, or None.
-      steps: decisions that the loop makes.
       say: takes a line for people.
     """
     config = config.copy_and_resolve_references()
@@ -176,7 +202,7 @@ def make_bench(
         # The loop shall act and learn from its first decision on.
         config.exploration_steps = 0
         config.seed_frames = config.action_repeat
-        config.total_frames = steps * config.action_repeat
+        config.total_frames = config.action_repeat
     run = _LoopOnly(config, folder, demonstrations, say)
     # A benchmark prints its table only.
     run.progress = ProgressLine(config.total_frames, stream=io.StringIO())

@@ -5,7 +5,6 @@ import pathlib
 import resource
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -19,6 +18,7 @@ from jaxil.timing import arithmetic, compiling, device, start
 from jaxil.timing.bench import Bench, make_bench
 from jaxil.timing.clock import timed
 
+_TURNS = 4  # of the loop's two forms
 _UPDATE_PARTS = ("encoder", "critic", "actor", "rewarder", "optimiser")
 
 
@@ -47,12 +47,10 @@ def measure(
     """
     demonstrations = experiment.load_demonstrations(config)
     with tempfile.TemporaryDirectory() as folder:
-        bench = make_bench(
-            config, pathlib.Path(folder), demonstrations, steps=steps, say=_say
-        )
+        bench = make_bench(config, pathlib.Path(folder), demonstrations, say=_say)
         with contextlib.closing(bench.run):
             parts, ranges = _time_parts(bench, repeats)
-            results = {**parts, **_time_loop(bench)}
+            results = {**parts, **_time_loop(bench, steps)}
             if full:
                 bench.fill_replay()
             results |= _memory(bench)
@@ -124,18 +122,21 @@ def _with(config: Config, **changes: Any) -> Config:
     return config
 
 
-def _time_loop(bench: Bench) -> dict[str, float]:
+def _time_loop(bench: Bench, steps: int) -> dict[str, float]:
+    """Times the loop as it is, and with updates that are waited for, in turn."""
     run, stopwatch = bench.run, bench.run.stopwatch
-    before, frames = sum(stopwatch.seconds.values()), run.frame
-    begin = time.perf_counter()
-    run.loop(whole_episodes=False)
-    # The last update may still run in the background: it is an update's time.
-    stopwatch.timed("update", jax.block_until_ready)(run.state.num_updates)
-    wall = time.perf_counter() - begin
-    working = sum(stopwatch.seconds.values()) - before
+    frames, seconds, working = [0, 0], [0.0, 0.0], [0.0, 0.0]
+    for turn in range(_TURNS):
+        share = steps * (turn + 1) // _TURNS - steps * turn // _TURNS
+        for waits in (False, True) if turn % 2 else (True, False):
+            first, before = run.frame, sum(stopwatch.seconds.values())
+            seconds[waits] += bench.loop(share, waits=waits)
+            working[waits] += sum(stopwatch.seconds.values()) - before
+            frames[waits] += run.frame - first
     return {
-        "frames_per_second": (run.frame - frames) / wall,
-        "loop_overhead_percent": 100.0 * (wall / working - 1.0),
+        "frames_per_second": frames[False] / seconds[False],
+        "frames_per_second_in_turn": frames[True] / seconds[True],
+        "loop_overhead_percent": 100.0 * (seconds[False] / working[False] - 1.0),
     }
 
 

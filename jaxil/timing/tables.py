@@ -30,6 +30,7 @@ ROWS: dict[str, dict[str, str]] = {
     },
     "the loop": {
         "frames_per_second": "acting and learning, nothing else",
+        "frames_per_second_in_turn": "the same, but nothing is done during updates",
         "loop_overhead_percent": "what it adds to environment, acting and updating",
         "run_frames_per_second": "with rewards, evaluations, checkpoints: added up",
         "reward_percent": "share of rewarding in the run's time",
@@ -54,7 +55,7 @@ ROWS: dict[str, dict[str, str]] = {
         "update_gflop_by_hand": "matrix products and convolutions, counted by hand",
         "encoder_share_percent": "the encoder's share of those",
         "matrix_product_gflops": "a second: this device's best float32 product",
-        "utilisation_percent": "the update's rate of that",
+        "utilisation_percent": "the update's rate of that; Winograd's form saves some",
     },
 }
 _SWEEP_COLUMNS = (
