@@ -35,8 +35,10 @@ typedef int32_t Mask __attribute__((vector_size(4 * LANES), aligned(4), may_alia
 #define UNROLL _Pragma("GCC unroll 16")
 
 /* Calls FUNCTION(n, ...) with an n that the compiler knows, of 1 to BLOCK. */
-#define CASE(n, FUNCTION, ...) \
-  case n: FUNCTION(n < BLOCK ? n : BLOCK, __VA_ARGS__); break;
+#define CASE(n, FUNCTION, ...)                    \
+  case n:                                         \
+    FUNCTION(n < BLOCK ? n : BLOCK, __VA_ARGS__); \
+    break;
 #define WITH_KNOWN(n, FUNCTION, ...) \
   switch (n) {                       \
     CASE(1, FUNCTION, __VA_ARGS__)   \
@@ -96,11 +98,13 @@ INLINE Vector finished(Vector sum, const Finish *finish, size_t point, size_t fe
 INLINE void sum_points(size_t n, const float *x, size_t step, size_t row, size_t rows,
                        size_t length, const float *w, size_t features, Vector *low,
                        Vector *high) {
-  UNROLL for (size_t p = 0; p < n; p++) low[p] = high[p] = (Vector){0};
+  UNROLL
+  for (size_t p = 0; p < n; p++) low[p] = high[p] = (Vector){0};
   for (size_t u = 0; u < rows; u++) {
     for (size_t k = 0; k < length; k++) {
       const Vector w_low = *(const Vector *)w, w_high = *(const Vector *)(w + LANES);
-      UNROLL for (size_t p = 0; p < n; p++) {
+      UNROLL
+      for (size_t p = 0; p < n; p++) {
         low[p] += x[u * row + p * step + k] * w_low;
         high[p] += x[u * row + p * step + k] * w_high;
       }
@@ -116,7 +120,8 @@ INLINE void convolve_points(size_t n, const Shape *s, const float *x, const floa
   Vector low[BLOCK], high[BLOCK];
   sum_points(n, x, s->stride * s->channels, s->width * s->channels, s->kernel_height,
              s->kernel_width * s->channels, w + feature, s->features, low, high);
-  UNROLL for (size_t p = 0; p < n; p++) {
+  UNROLL
+  for (size_t p = 0; p < n; p++) {
     float *to = y + p * y_step + feature;
     *(Vector *)to = finished(low[p], finish, point + p, feature, s->features);
     *(Vector *)(to + LANES) =
@@ -129,7 +134,8 @@ INLINE void correlate_points(size_t n, const float *x, size_t step, size_t row,
                              size_t height, size_t width, Points g, float *w,
                              size_t features) {
   Vector low[BLOCK], high[BLOCK];
-  UNROLL for (size_t k = 0; k < n; k++) {
+  UNROLL
+  for (size_t k = 0; k < n; k++) {
     low[k] = *(const Vector *)(w + k * features);
     high[k] = *(const Vector *)(w + k * features + LANES);
   }
@@ -137,7 +143,8 @@ INLINE void correlate_points(size_t n, const float *x, size_t step, size_t row,
     const float *here = x + i * row, *at = g.at + i * g.row;
     for (size_t j = 0; j < width; j++) {
       const Vector g_low = *(const Vector *)at, g_high = *(const Vector *)(at + LANES);
-      UNROLL for (size_t k = 0; k < n; k++) {
+      UNROLL
+      for (size_t k = 0; k < n; k++) {
         low[k] += here[k] * g_low;
         high[k] += here[k] * g_high;
       }
@@ -145,7 +152,8 @@ INLINE void correlate_points(size_t n, const float *x, size_t step, size_t row,
       at += g.step;
     }
   }
-  UNROLL for (size_t k = 0; k < n; k++) {
+  UNROLL
+  for (size_t k = 0; k < n; k++) {
     *(Vector *)(w + k * features) = low[k];
     *(Vector *)(w + k * features + LANES) = high[k];
   }

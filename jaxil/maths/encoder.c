@@ -7,13 +7,13 @@
    This file is XLA's side: buffers in, buffers out, a batch shared out to threads. What
    is done with an image is in the headers. */
 
-#include <sched.h>
 #include <stdatomic.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "layers.h"
+#include "threads.h"
 #include "xla/ffi/api/c_api.h"
 
 #define MOST_LAYERS 8
@@ -25,86 +25,14 @@ typedef struct {
   const float *mean;
   size_t mean_size; /* 1, or that of an image */
   float contrast;
-  float *y[MOST_LAYERS];              /* outputs of the layers; NULL: not wanted */
-  const float *cotangent;             /* of the last one */
-  float *sums;                        /* of gradients, one after the other */
-  size_t num_sums, sum_size;          /* how many, and numbers in one */
-  size_t gradients[MOST_LAYERS];      /* where the gradients of a layer begin in it */
-  float *kernels;                     /* what `prepare` has allocated */
+  float *y[MOST_LAYERS];         /* outputs of the layers; NULL: not wanted */
+  const float *cotangent;        /* of the last one */
+  float *sums;                   /* of gradients, one after the other */
+  size_t num_sums, sum_size;     /* how many, and numbers in one */
+  size_t gradients[MOST_LAYERS]; /* where the gradients of a layer begin in it */
+  float *kernels;                /* what `prepare` has allocated */
   atomic_int out_of_memory;
 } Call;
-
-typedef void Work(Call *call, size_t part);
-
-/* Parts of a batch that are handed out one by one. The last of its users frees it. */
-typedef struct {
-  Work *work;
-  Call *call;
-  size_t count;
-  atomic_size_t next, done, users;
-} Team;
-
-static void leave(Team *team) {
-  if (atomic_fetch_sub(&team->users, 1) == 1) free(team);
-}
-
-static void take_part(void *data) {
-  Team *team = data;
-  size_t part;
-  while ((part = atomic_fetch_add(&team->next, 1)) < team->count) {
-    team->work(team->call, part);
-    atomic_fetch_add(&team->done, 1);
-  }
-  leave(team);
-}
-
-static int succeeded(XLA_FFI_CallFrame *frame, XLA_FFI_Error *error) {
-  if (error == NULL) return 1;
-  XLA_FFI_Error_Destroy_Args args = {
-      .struct_size = XLA_FFI_Error_Destroy_Args_STRUCT_SIZE,
-      .error = error,
-  };
-  frame->api->XLA_FFI_Error_Destroy(&args);
-  return 0;
-}
-
-/* Returns how many threads XLA has; 1 where it doesn't tell. */
-static size_t number_of_threads(XLA_FFI_CallFrame *frame) {
-  int64_t threads = 1;
-  XLA_FFI_ThreadPool_NumThreads_Args args = {
-      .struct_size = XLA_FFI_ThreadPool_NumThreads_Args_STRUCT_SIZE,
-      .ctx = frame->ctx,
-      .num_threads = &threads,
-  };
-  const int known = succeeded(frame, frame->api->XLA_FFI_ThreadPool_NumThreads(&args));
-  return known && threads > 1 ? (size_t)threads : 1;
-}
-
-/* Works on all parts, with the threads of XLA that are free. A thread that comes too
-   late finds none left; so only parts in work are waited for, and that always ends. */
-static void for_each(size_t count, XLA_FFI_CallFrame *frame, Work *work, Call *call) {
-  const size_t threads = number_of_threads(frame);
-  const size_t members = threads < count ? threads : count;
-  Team *team = members > 1 ? malloc(sizeof(Team)) : NULL;
-  if (team == NULL) {
-    for (size_t part = 0; part < count; part++) work(call, part);
-    return;
-  }
-  *team = (Team){.work = work, .call = call, .count = count};
-  atomic_init(&team->users, members + 1); /* once more, for the one who waits */
-  for (size_t k = 1; k < members; k++) {
-    XLA_FFI_ThreadPool_Schedule_Args task = {
-        .struct_size = XLA_FFI_ThreadPool_Schedule_Args_STRUCT_SIZE,
-        .ctx = frame->ctx,
-        .task = take_part,
-        .data = team,
-    };
-    if (!succeeded(frame, frame->api->XLA_FFI_ThreadPool_Schedule(&task))) leave(team);
-  }
-  take_part(team);
-  while (atomic_load(&team->done) < count) sched_yield();
-  leave(team);
-}
 
 static XLA_FFI_Error *no_memory(XLA_FFI_CallFrame *frame) {
   XLA_FFI_Error_Create_Args error = {
@@ -121,7 +49,8 @@ static int answers_metadata(XLA_FFI_CallFrame *frame) {
   const void *extension = frame->extension_start;
   if (extension == NULL || frame->extension_start->type != XLA_FFI_Extension_Metadata)
     return 0;
-  XLA_FFI_Metadata *metadata = ((const XLA_FFI_Metadata_Extension *)extension)->metadata;
+  XLA_FFI_Metadata *metadata =
+      ((const XLA_FFI_Metadata_Extension *)extension)->metadata;
   metadata->api_version.major_version = XLA_FFI_API_MAJOR;
   metadata->api_version.minor_version = XLA_FFI_API_MINOR;
   return 1;
@@ -228,7 +157,8 @@ static void centre(const Call *call, size_t image, float *x) {
   }
 }
 
-static void encode_image(Call *call, size_t image) {
+static void encode_image(void *data, size_t image) {
+  Call *call = data;
   const Layer *layers = call->layers;
   size_t most = 0, scratch_size = 0;
   for (size_t l = 0; l < call->count; l++) {
@@ -255,7 +185,8 @@ XLA_FFI_Error *jaxil_encode(XLA_FFI_CallFrame *frame) {
   if (answers_metadata(frame)) return NULL;
   Call call = read_call(frame, (frame->args.size - 2) / 2);
   const size_t wanted = frame->rets.size, first = call.count - wanted;
-  for (size_t l = first; l < call.count; l++) call.y[l] = result(frame, l - first)->data;
+  for (size_t l = first; l < call.count; l++)
+    call.y[l] = result(frame, l - first)->data;
   if (!prepare(&call, 0)) return no_memory(frame);
   for_each(call.batch, frame, encode_image, &call);
   free(call.kernels);
@@ -278,7 +209,8 @@ static Points place_cotangent(const Layer *layer, size_t l, float *array) {
   return in_frame(layer, array);
 }
 
-static void differentiate_images(Call *call, size_t part) {
+static void differentiate_images(void *data, size_t part) {
+  Call *call = data;
   const Layer *layers = call->layers;
   size_t most = 0, scratch_size = 0;
   for (size_t l = 0; l < call->count; l++) {
@@ -317,7 +249,8 @@ static void differentiate_images(Call *call, size_t part) {
 
 #define NUMBERS_OF_A_SLICE 4096
 
-static void add_up_slice(Call *call, size_t slice) {
+static void add_up_slice(void *data, size_t slice) {
+  Call *call = data;
   const size_t first = slice * NUMBERS_OF_A_SLICE;
   size_t end = first + NUMBERS_OF_A_SLICE;
   if (end > call->sum_size) end = call->sum_size;

@@ -12,8 +12,8 @@
    in a frame of zeros with the kernel turned around. */
 typedef struct {
   Shape shape, back;
-  int winograd, back_winograd;      /* whether it is computed in Winograd's form */
-  const float *kernel, *turned;     /* transformed then */
+  int winograd, back_winograd;  /* whether it is computed in Winograd's form */
+  const float *kernel, *turned; /* transformed then */
   const float *bias;
 } Layer;
 
@@ -56,8 +56,8 @@ static Points in_frame(const Layer *layer, float *frame) {
   const Shape *s = &layer->shape, *back = &layer->back;
   const size_t row = back->width * back->channels;
   return (Points){
-      .at = frame + (s->kernel_height - 1) * row +
-            (s->kernel_width - 1) * back->channels,
+      .at =
+          frame + (s->kernel_height - 1) * row + (s->kernel_width - 1) * back->channels,
       .row = s->stride * row,
       .step = s->stride * back->channels,
   };

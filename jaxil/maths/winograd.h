@@ -65,8 +65,10 @@ INLINE void gradient_transform(const Vector *x, Vector *y, size_t step) {
 #define TRANSFORM(T, n, m, x, y)                                          \
   do {                                                                    \
     Vector half[SIDE][SIDE];                                              \
-    UNROLL for (size_t j_ = 0; j_ < (n); j_++) T(&x[0][j_], &half[0][j_], SIDE); \
-    UNROLL for (size_t i_ = 0; i_ < (m); i_++) T(half[i_], y[i_], 1);      \
+    UNROLL                                                                \
+    for (size_t j_ = 0; j_ < (n); j_++) T(&x[0][j_], &half[0][j_], SIDE); \
+    UNROLL                                                                \
+    for (size_t i_ = 0; i_ < (m); i_++) T(half[i_], y[i_], 1);            \
   } while (0)
 
 /* Which tile of an image: its first point of the output. In an odd row or column the
@@ -100,11 +102,13 @@ static void transform_kernel(const Shape *s, const float *kernel, float *u) {
   const size_t size = s->channels * s->features;
   for (size_t k = 0; k < size; k += LANES) {
     Vector x[SIDE][SIDE], y[SIDE][SIDE];
-    UNROLL for (size_t v = 0; v < 9; v++)
-        x[v / 3][v % 3] = *(const Vector *)(kernel + v * size + k);
+    UNROLL
+    for (size_t v = 0; v < 9; v++)
+      x[v / 3][v % 3] = *(const Vector *)(kernel + v * size + k);
     TRANSFORM(kernel_transform, 3, SIDE, x, y);
-    UNROLL for (size_t e = 0; e < ELEMENTS; e++)
-        *(Vector *)(u + e * size + k) = y[e / SIDE][e % SIDE];
+    UNROLL
+    for (size_t e = 0; e < ELEMENTS; e++)
+      *(Vector *)(u + e * size + k) = y[e / SIDE][e % SIDE];
   }
 }
 
@@ -113,11 +117,13 @@ static void transform_gradient(const Shape *s, const float *u, float *gradient) 
   const size_t size = s->channels * s->features;
   for (size_t k = 0; k < size; k += LANES) {
     Vector x[SIDE][SIDE], y[SIDE][SIDE];
-    UNROLL for (size_t e = 0; e < ELEMENTS; e++)
-        x[e / SIDE][e % SIDE] = *(const Vector *)(u + e * size + k);
+    UNROLL
+    for (size_t e = 0; e < ELEMENTS; e++)
+      x[e / SIDE][e % SIDE] = *(const Vector *)(u + e * size + k);
     TRANSFORM(gradient_transform, SIDE, 3, x, y);
-    UNROLL for (size_t v = 0; v < 9; v++)
-        *(Vector *)(gradient + v * size + k) = y[v / 3][v % 3];
+    UNROLL
+    for (size_t v = 0; v < 9; v++)
+      *(Vector *)(gradient + v * size + k) = y[v / 3][v % 3];
   }
 }
 
@@ -127,12 +133,14 @@ INLINE void transform_tile(const Shape *s, const float *x, Tile tile, float *poi
   const float *from = x + (tile.i * s->width + tile.j) * s->channels;
   for (size_t c = 0; c < s->channels; c += LANES) {
     Vector d[SIDE][SIDE], e[SIDE][SIDE];
-    UNROLL for (size_t k = 0; k < ELEMENTS; k++)
-        d[k / SIDE][k % SIDE] = *(const Vector *)(
-            from + (k / SIDE * s->width + k % SIDE) * s->channels + c);
+    UNROLL
+    for (size_t k = 0; k < ELEMENTS; k++)
+      d[k / SIDE][k % SIDE] =
+          *(const Vector *)(from + (k / SIDE * s->width + k % SIDE) * s->channels + c);
     TRANSFORM(image_transform, SIDE, SIDE, d, e);
-    UNROLL for (size_t k = 0; k < ELEMENTS; k++)
-        *(Vector *)(points + k * step + c) = e[k / SIDE][k % SIDE];
+    UNROLL
+    for (size_t k = 0; k < ELEMENTS; k++)
+      *(Vector *)(points + k * step + c) = e[k / SIDE][k % SIDE];
   }
 }
 
@@ -141,10 +149,12 @@ INLINE void finish_tile(const Shape *s, const float *sums, size_t step, Tile til
                         const Finish *finish, Points y) {
   for (size_t f = 0; f < s->features; f += LANES) {
     Vector d[SIDE][SIDE], e[2][SIDE];
-    UNROLL for (size_t k = 0; k < ELEMENTS; k++)
-        d[k / SIDE][k % SIDE] = *(const Vector *)(sums + k * step + f);
+    UNROLL
+    for (size_t k = 0; k < ELEMENTS; k++)
+      d[k / SIDE][k % SIDE] = *(const Vector *)(sums + k * step + f);
     TRANSFORM(output_transform, SIDE, 2, d, e);
-    UNROLL for (size_t k = 0; k < 4; k++) {
+    UNROLL
+    for (size_t k = 0; k < 4; k++) {
       const size_t i = tile.i + k / 2, j = tile.j + k % 2;
       *(Vector *)(y.at + i * y.row + j * y.step + f) =
           finished(e[k / 2][k % 2], finish, i * s->out_width + j, f, s->features);
@@ -158,14 +168,16 @@ INLINE void transform_cotangent(const Shape *s, Points g, Tile tile, float *poin
   const float *from = g.at + tile.i * g.row + tile.j * g.step;
   for (size_t f = 0; f < s->features; f += LANES) {
     Vector d[2][SIDE], e[SIDE][SIDE];
-    UNROLL for (size_t k = 0; k < 4; k++) {
+    UNROLL
+    for (size_t k = 0; k < 4; k++) {
       const int again = k / 2 < tile.i_again || k % 2 < tile.j_again;
       const float *at = from + k / 2 * g.row + k % 2 * g.step + f;
       d[k / 2][k % 2] = again ? (Vector){0} : *(const Vector *)at;
     }
     TRANSFORM(cotangent_transform, 2, SIDE, d, e);
-    UNROLL for (size_t k = 0; k < ELEMENTS; k++)
-        *(Vector *)(points + k * step + f) = e[k / SIDE][k % SIDE];
+    UNROLL
+    for (size_t k = 0; k < ELEMENTS; k++)
+      *(Vector *)(points + k * step + f) = e[k / SIDE][k % SIDE];
   }
 }
 
@@ -188,7 +200,8 @@ INLINE void multiply_points(size_t n, const Shape *s, const float *points,
                             const float *w, float *sums) {
   Vector low[BLOCK], high[BLOCK];
   sum_points(n, points, s->channels, 0, 1, s->channels, w, s->features, low, high);
-  UNROLL for (size_t p = 0; p < n; p++) {
+  UNROLL
+  for (size_t p = 0; p < n; p++) {
     *(Vector *)(sums + p * s->features) = low[p];
     *(Vector *)(sums + p * s->features + LANES) = high[p];
   }
