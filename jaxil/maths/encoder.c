@@ -7,7 +7,6 @@
    This file is XLA's side: buffers in, buffers out, a batch shared out to threads. What
    is done with an image is in the headers. */
 
-#include <stdatomic.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
@@ -31,7 +30,6 @@ typedef struct {
   size_t num_sums, sum_size;     /* how many, and numbers in one */
   size_t gradients[MOST_LAYERS]; /* where the gradients of a layer begin in it */
   float *kernels;                /* what `prepare` has allocated */
-  atomic_int out_of_memory;
 } Call;
 
 static XLA_FFI_Error *no_memory(XLA_FFI_CallFrame *frame) {
@@ -137,13 +135,6 @@ static int prepare(Call *call, int backward) {
   return 1;
 }
 
-/* Memory for one part of a batch; NULL, and the call fails, if there is none. */
-static float *scratch_for(Call *call, size_t size) {
-  float *scratch = malloc(size * sizeof(float));
-  if (scratch == NULL) atomic_store(&call->out_of_memory, 1);
-  return scratch;
-}
-
 /* x = contrast (pixels / 255 - mean) of one image. */
 static void centre(const Call *call, size_t image, float *x) {
   const size_t size = image_size(&call->layers[0].shape);
@@ -157,27 +148,34 @@ static void centre(const Call *call, size_t image, float *x) {
   }
 }
 
-static void encode_image(void *data, size_t image) {
+/* Numbers in the largest output of a layer. */
+static size_t largest_output(const Call *call) {
+  size_t most = 0;
+  for (size_t l = 0; l < call->count; l++)
+    most = larger(most, output_size(&call->layers[l].shape));
+  return most;
+}
+
+static size_t encode_scratch(const Call *call) {
+  size_t scratch = 0;
+  for (size_t l = 0; l < call->count; l++)
+    scratch = larger(scratch, forward_scratch(&call->layers[l]));
+  return image_size(&call->layers[0].shape) + 2 * largest_output(call) + scratch;
+}
+
+static void encode_image(void *data, size_t image, float *x) {
   Call *call = data;
   const Layer *layers = call->layers;
-  size_t most = 0, scratch_size = 0;
-  for (size_t l = 0; l < call->count; l++) {
-    most = larger(most, output_size(&layers[l].shape));
-    scratch_size = larger(scratch_size, forward_scratch(&layers[l]));
-  }
-  const size_t pixels = image_size(&layers[0].shape);
-  float *x = scratch_for(call, pixels + 2 * most + scratch_size);
-  if (x == NULL) return;
-  float *between[] = {x + pixels, x + pixels + most}, *scratch = between[1] + most;
+  float *first = x + image_size(&layers[0].shape);
+  float *second = first + largest_output(call), *between[] = {first, second};
   centre(call, image, x);
   const float *from = x;
   for (size_t l = 0; l < call->count; l++) {
     float *y = call->y[l] ? call->y[l] + image * output_size(&layers[l].shape)
                           : between[l % 2];
-    go_forward(&layers[l], from, y, scratch);
+    go_forward(&layers[l], from, y, second + largest_output(call));
     from = y;
   }
-  free(x);
 }
 
 /* pixels, mean, (kernel, bias) of each layer -> y of each layer, or of the last one */
@@ -188,9 +186,10 @@ XLA_FFI_Error *jaxil_encode(XLA_FFI_CallFrame *frame) {
   for (size_t l = first; l < call.count; l++)
     call.y[l] = result(frame, l - first)->data;
   if (!prepare(&call, 0)) return no_memory(frame);
-  for_each(call.batch, frame, encode_image, &call);
+  const int done =
+      for_each(call.batch, frame, encode_image, &call, encode_scratch(&call));
   free(call.kernels);
-  return atomic_load(&call.out_of_memory) ? no_memory(frame) : NULL;
+  return done ? NULL : no_memory(frame);
 }
 
 /* So many images have one sum of their gradients. It is a constant, and the sums are
@@ -209,48 +208,59 @@ static Points place_cotangent(const Layer *layer, size_t l, float *array) {
   return in_frame(layer, array);
 }
 
-static void differentiate_images(void *data, size_t part) {
-  Call *call = data;
+static size_t largest_cotangent(const Call *call) {
+  size_t most = 0;
+  for (size_t l = 0; l < call->count; l++)
+    most = larger(most, cotangent_size(&call->layers[l], l));
+  return most;
+}
+
+static size_t gradient_scratch(const Call *call) {
+  size_t scratch = 0;
+  for (size_t l = 0; l < call->count; l++)
+    scratch = larger(scratch, backward_scratch(&call->layers[l]));
+  return image_size(&call->layers[0].shape) + 2 * largest_cotangent(call) + scratch;
+}
+
+/* Goes back through the layers of an image, from the last one's cotangent. */
+static void differentiate_image(const Call *call, size_t image, float *sums, float *x) {
   const Layer *layers = call->layers;
-  size_t most = 0, scratch_size = 0;
-  for (size_t l = 0; l < call->count; l++) {
-    most = larger(most, cotangent_size(&layers[l], l));
-    scratch_size = larger(scratch_size, backward_scratch(&layers[l]));
-  }
-  const size_t pixels = image_size(&layers[0].shape);
-  float *x = scratch_for(call, pixels + 2 * most + scratch_size);
-  if (x == NULL) return;
-  float *frames[] = {x + pixels, x + pixels + most}, *scratch = frames[1] + most;
-  float *sums = call->sums + part * call->sum_size;
-  memset(sums, 0, call->sum_size * sizeof(float));
   const size_t last = call->count - 1, size = output_size(&layers[last].shape);
-  const size_t first = part * IMAGES_OF_A_SUM, end = first + IMAGES_OF_A_SUM;
-  for (size_t image = first; image < end && image < call->batch; image++) {
-    centre(call, image, x);
-    float *frame = frames[last % 2];
-    Points g = place_cotangent(&layers[last], last, frame);
-    pass_relu(&layers[last].shape, call->y[last] + image * size,
-              call->cotangent + image * size, g);
-    for (size_t l = last;; l--) {
-      const Layer *layer = &layers[l];
-      const float *from = l ? call->y[l - 1] + image * image_size(&layer->shape) : x;
-      float *kernel = sums + call->gradients[l];
-      float *bias = kernel + kernel_size(&layer->shape, layer->winograd);
-      add_gradients(layer, from, g, kernel, bias, scratch);
-      if (l == 0) break;
-      float *next = frames[(l - 1) % 2];
-      g = place_cotangent(&layers[l - 1], l - 1, next);
-      go_backward(layer, frame, from, g, scratch);
-      frame = next;
-    }
+  float *first = x + image_size(&layers[0].shape);
+  float *second = first + largest_cotangent(call), *frames[] = {first, second};
+  float *scratch = second + largest_cotangent(call), *frame = frames[last % 2];
+  centre(call, image, x);
+  Points g = place_cotangent(&layers[last], last, frame);
+  pass_relu(&layers[last].shape, call->y[last] + image * size,
+            call->cotangent + image * size, g);
+  for (size_t l = last;; l--) {
+    const Layer *layer = &layers[l];
+    const float *from = l ? call->y[l - 1] + image * image_size(&layer->shape) : x;
+    float *kernel = sums + call->gradients[l];
+    float *bias = kernel + kernel_size(&layer->shape, layer->winograd);
+    add_gradients(layer, from, g, kernel, bias, scratch);
+    if (l == 0) return;
+    float *next = frames[(l - 1) % 2];
+    g = place_cotangent(&layers[l - 1], l - 1, next);
+    go_backward(layer, frame, from, g, scratch);
+    frame = next;
   }
-  free(x);
+}
+
+static void differentiate_images(void *data, size_t part, float *scratch) {
+  const Call *call = data;
+  float *sums = call->sums + part * call->sum_size;
+  const size_t first = part * IMAGES_OF_A_SUM, end = first + IMAGES_OF_A_SUM;
+  memset(sums, 0, call->sum_size * sizeof(float));
+  for (size_t image = first; image < end && image < call->batch; image++)
+    differentiate_image(call, image, sums, scratch);
 }
 
 #define NUMBERS_OF_A_SLICE 4096
 
-static void add_up_slice(void *data, size_t slice) {
-  Call *call = data;
+static void add_up_slice(void *data, size_t slice, float *scratch) {
+  const Call *call = data;
+  (void)scratch;
   const size_t first = slice * NUMBERS_OF_A_SLICE;
   size_t end = first + NUMBERS_OF_A_SLICE;
   if (end > call->sum_size) end = call->sum_size;
@@ -279,9 +289,10 @@ XLA_FFI_Error *jaxil_encode_gradient(XLA_FFI_CallFrame *frame) {
     free(call.sums);
     return no_memory(frame);
   }
-  for_each(call.num_sums, frame, differentiate_images, &call);
   const size_t slices = (call.sum_size + NUMBERS_OF_A_SLICE - 1) / NUMBERS_OF_A_SLICE;
-  for_each(slices, frame, add_up_slice, &call);
+  const int done = for_each(call.num_sums, frame, differentiate_images, &call,
+                            gradient_scratch(&call)) &&
+                   for_each(slices, frame, add_up_slice, &call, 0);
   for (size_t l = 0; l < call.count; l++) {
     const Layer *layer = &call.layers[l];
     const Shape *s = &layer->shape;
@@ -296,5 +307,5 @@ XLA_FFI_Error *jaxil_encode_gradient(XLA_FFI_CallFrame *frame) {
   }
   free(call.kernels);
   free(call.sums);
-  return atomic_load(&call.out_of_memory) ? no_memory(frame) : NULL;
+  return done ? NULL : no_memory(frame);
 }

@@ -10,29 +10,41 @@
 
 #include "xla/ffi/api/c_api.h"
 
-/* What is done with a part of a call, of which there are so many. */
-typedef void Work(void *call, size_t part);
+/* What is done with a part of a call; the scratch is the thread's, and stays in its
+   cache from one part to the next. */
+typedef void Work(void *call, size_t part, float *scratch);
 
 /* Parts of a batch that are handed out one by one. The last of its users frees it. */
 typedef struct {
   Work *work;
   void *call;
-  size_t count;
+  size_t count, scratch_size;
   atomic_size_t next, done, users;
+  atomic_int out_of_memory;
 } Team;
 
 static void leave(Team *team) {
   if (atomic_fetch_sub(&team->users, 1) == 1) free(team);
 }
 
-static void take_part(void *data) {
-  Team *team = data;
+/* Works on parts as long as there are any. */
+static void work_on(Team *team) {
+  float *scratch = NULL;
   size_t part;
   while ((part = atomic_fetch_add(&team->next, 1)) < team->count) {
-    team->work(team->call, part);
+    if (scratch == NULL) scratch = malloc((team->scratch_size + 1) * sizeof(float));
+    if (scratch == NULL)
+      atomic_store(&team->out_of_memory, 1);
+    else
+      team->work(team->call, part, scratch);
     atomic_fetch_add(&team->done, 1);
   }
-  leave(team);
+  free(scratch);
+}
+
+static void take_part(void *data) {
+  work_on(data);
+  leave(data);
 }
 
 static int succeeded(XLA_FFI_CallFrame *frame, XLA_FFI_Error *error) {
@@ -58,17 +70,17 @@ static size_t number_of_threads(XLA_FFI_CallFrame *frame) {
 }
 
 /* Works on all parts, with the threads of XLA that are free. A thread that comes too
-   late finds none left; so only parts in work are waited for, and that always ends. */
-static void for_each(size_t count, XLA_FFI_CallFrame *frame, Work *work, void *call) {
+   late finds none left; so only parts in work are waited for, and that always ends.
+   Returns 0 if there was no memory for scratches of so many numbers. */
+static int for_each(size_t count, XLA_FFI_CallFrame *frame, Work *work, void *call,
+                    size_t scratch_size) {
+  Team *team = malloc(sizeof(Team));
+  if (team == NULL) return 0;
+  *team =
+      (Team){.work = work, .call = call, .count = count, .scratch_size = scratch_size};
   const size_t threads = number_of_threads(frame);
   const size_t members = threads < count ? threads : count;
-  Team *team = members > 1 ? malloc(sizeof(Team)) : NULL;
-  if (team == NULL) {
-    for (size_t part = 0; part < count; part++) work(call, part);
-    return;
-  }
-  *team = (Team){.work = work, .call = call, .count = count};
-  atomic_init(&team->users, members + 1); /* once more, for the one who waits */
+  atomic_init(&team->users, members);
   for (size_t k = 1; k < members; k++) {
     XLA_FFI_ThreadPool_Schedule_Args task = {
         .struct_size = XLA_FFI_ThreadPool_Schedule_Args_STRUCT_SIZE,
@@ -78,9 +90,11 @@ static void for_each(size_t count, XLA_FFI_CallFrame *frame, Work *work, void *c
     };
     if (!succeeded(frame, frame->api->XLA_FFI_ThreadPool_Schedule(&task))) leave(team);
   }
-  take_part(team);
+  work_on(team);
   while (atomic_load(&team->done) < count) sched_yield();
+  const int memory_was_there = !atomic_load(&team->out_of_memory);
   leave(team);
+  return memory_was_there;
 }
 
 #endif
