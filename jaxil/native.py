@@ -1,8 +1,8 @@
-"""Our own convolution in C, compiled for this machine's processor, known to XLA.
+"""Our own encoder in C, compiled for this machine's processor, known to XLA.
 
-XLA's reach two thirds of what a CPU core can do, and these all of it, see
-`launch/results/speed.md`, 10. The C compiler is the machine's. Where there is none, and
-on other devices, XLA's own are used.
+XLA's convolutions reach two thirds of what a CPU core can do, and take twice as many
+products as 3x3 kernels need, see `launch/results/speed.md`, 10 and 12. The C compiler
+is the machine's. Where there is none, and on other devices, XLA's own are used.
 """
 
 import ctypes

@@ -167,6 +167,15 @@ def test_encoders_of_the_presets(side, layers):
     assert_same(draw(0, (7, side, side, 9), layers), tolerance=1e-4)
 
 
+def test_as_many_layers_as_it_takes():
+    drawn = draw(7, (2, 5, 6, 3), ((2, 32, 1), *[(1, 32, 1)] * 7))
+    assert len(drawn[2]) == encoding.MOST_LAYERS
+    assert_same(drawn, tolerance=1e-4)
+    one_more = [*drawn[2], drawn[2][-1]]
+    with pytest.raises(AssertionError):
+        encoding.encode(*drawn[:2], one_more, contrast=1.0, strides=(1,) * 9)
+
+
 def test_a_mean_of_one_number():
     pixels, _, weights, strides = draw(1, (3, 20, 21, 3), ((4, 32, 2), (3, 32, 1)))
     assert_same((pixels, jnp.full((), 0.5), weights, strides))
