@@ -65,38 +65,13 @@ def encode(
         chex.assert_equal(kernel.shape[3], bias.shape[0])
         channels = kernel.shape[3]
         assert channels % FEATURES == 0, channels
-    return _ENCODE(contrast, strides, pixels, mean, tuple(weights))
+    settings = _Settings(contrast, strides)
+    return _ENCODE(settings, pixels, mean, tuple(weights))
 
 
-def _encode(
-    contrast: float,
-    strides: tuple[int, ...],
-    pixels: Array,
-    mean: Array,
-    weights: tuple[Weights, ...],
-) -> Array:
-    (y,) = _forward(contrast, strides, pixels, mean, weights, wanted=1)
-    return y
-
-
-def _forward(
-    contrast: float,
-    strides: tuple[int, ...],
-    pixels: Array,
-    mean: Array,
-    weights: tuple[Weights, ...],
-    *,
-    wanted: int,
-) -> Sequence[Array]:
-    """Returns the outputs of the last layers, as many as are wanted."""
-    size, shapes = pixels.shape[1:3], []
-    for (kernel, _), stride in zip(weights, strides, strict=True):
-        assert all(n >= k for n, k in zip(size, kernel.shape)), (size, kernel.shape)
-        size = tuple((n - k) // stride + 1 for n, k in zip(size, kernel.shape))
-        shapes.append(_array(pixels.shape[0], *size, kernel.shape[3]))
-    return _call(
-        "jaxil_encode", shapes[-wanted:], contrast, strides, pixels, mean, *weights
-    )
+class _Settings(NamedTuple):
+    contrast: float
+    strides: tuple[int, ...]
 
 
 class _Saved(NamedTuple):
@@ -108,39 +83,48 @@ class _Saved(NamedTuple):
     outputs: Sequence[Array]
 
 
-def _encode_forward(
-    contrast: float,
-    strides: tuple[int, ...],
-    pixels: Array,
-    mean: Array,
-    weights: tuple[Weights, ...],
+def _encode(
+    settings: _Settings, pixels: Array, mean: Array, weights: tuple[Weights, ...]
+) -> Array:
+    (y,) = _outputs(settings, pixels, mean, weights, wanted=1)
+    return y
+
+
+def _forward(
+    settings: _Settings, pixels: Array, mean: Array, weights: tuple[Weights, ...]
 ) -> tuple[Array, _Saved]:
-    outputs = _forward(contrast, strides, pixels, mean, weights, wanted=len(weights))
+    outputs = _outputs(settings, pixels, mean, weights, wanted=len(weights))
     return outputs[-1], _Saved(pixels, mean, weights, outputs)
 
 
-def _encode_backward(
-    contrast: float, strides: tuple[int, ...], saved: _Saved, cotangent: Array
+def _backward(
+    settings: _Settings, saved: _Saved, cotangent: Array
 ) -> tuple[None, None, tuple[Weights, ...]]:
-    pixels, mean, weights, outputs = saved
-    shapes = [_array(*leaf.shape) for leaf in jax.tree.leaves(weights)]
-    gradients = _call(
-        "jaxil_encode_gradient",
-        shapes,
-        contrast,
-        strides,
-        pixels,
-        mean,
-        *weights,
-        *outputs,
-        cotangent,
-    )
+    shapes = [_array(*leaf.shape) for leaf in jax.tree.leaves(saved.weights)]
+    gradients = _call("jaxil_encode_gradient", shapes, settings, saved, cotangent)
     of_layers = zip(gradients[::2], gradients[1::2], strict=True)
     return None, None, tuple(Weights(*layer) for layer in of_layers)
 
 
-_ENCODE: Any = jax.custom_vjp(_encode, nondiff_argnums=(0, 1))
-_ENCODE.defvjp(_encode_forward, _encode_backward)
+_ENCODE: Any = jax.custom_vjp(_encode, nondiff_argnums=(0,))
+_ENCODE.defvjp(_forward, _backward)
+
+
+def _outputs(
+    settings: _Settings,
+    pixels: Array,
+    mean: Array,
+    weights: tuple[Weights, ...],
+    *,
+    wanted: int,
+) -> Sequence[Array]:
+    """Returns the outputs of the last layers, as many as are wanted."""
+    size, shapes = pixels.shape[1:3], []
+    for (kernel, _), stride in zip(weights, settings.strides, strict=True):
+        assert all(n >= k for n, k in zip(size, kernel.shape)), (size, kernel.shape)
+        size = tuple((n - k) // stride + 1 for n, k in zip(size, kernel.shape))
+        shapes.append(_array(pixels.shape[0], *size, kernel.shape[3]))
+    return _call("jaxil_encode", shapes[-wanted:], settings, pixels, mean, weights)
 
 
 def _array(*shape: int) -> jax.ShapeDtypeStruct:
@@ -149,15 +133,14 @@ def _array(*shape: int) -> jax.ShapeDtypeStruct:
 
 def _call(
     name: str,
-    results: list[jax.ShapeDtypeStruct],
-    contrast: float,
-    strides: tuple[int, ...],
+    results: Sequence[jax.ShapeDtypeStruct],
+    settings: _Settings,
     *arguments: Any,
 ) -> Sequence[Array]:
-    """Calls a function of encoder.c."""
+    """Calls a function of encoder.c with the leaves of the arguments in their order."""
     call = jax.ffi.ffi_call(name, results, vmap_method="sequential")
     return call(
         *jax.tree.leaves(arguments),
-        contrast=np.float32(contrast),
-        strides=np.asarray(strides, np.int64),
+        contrast=np.float32(settings.contrast),
+        strides=np.asarray(settings.strides, np.int64),
     )
