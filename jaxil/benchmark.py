@@ -133,7 +133,7 @@ def _define(values: flags.FlagValues) -> None:
     flags.DEFINE_integer(
         "steps",
         40,
-        "decisions of the loop to time",
+        "decisions to time of the loop, with and without overlap",
         lower_bound=2,
         upper_bound=1_000_000,
         flag_values=values,

@@ -36,7 +36,7 @@ def measure(
       config: checked.
       repeats: timings of each part, of which the median counts: ten times as many of
         the short ones, fewer of the longest.
-      steps: decisions of the loop that are timed.
+      steps: decisions that are timed of each of the loop's two forms.
       environment: variables of the process in which starting is timed; None leaves
         that out, and compiling without a cache.
       full: whether the replay is filled before memory is weighed.
