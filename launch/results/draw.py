@@ -17,7 +17,7 @@ _COLOURS = {"pdac": "#1f6f8b", "psil": "#c8553d", "drqv2": "#588157", "zero": "#
 _STYLES = {2: "-", 4: "--", 8: "-."}  # by action repeat
 _PENALTY = 10.0  # the discriminator's, in the paper
 # In the names of runs that only the code tells apart, which was older or newer.
-_SAME_SETTINGS = {"again": "-.", "native": "-", "winograd": ":"}
+_SAME_SETTINGS = {"again": "-.", "native": "-", "winograd": ":", "quickstart": "-"}
 _COLUMNS = 2
 _NAMES = {"pdac": "P-DAC", "psil": "P-SIL", "drqv2": "true reward", "zero": "no reward"}
 
