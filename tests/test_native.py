@@ -1,6 +1,8 @@
 """Compiling our own convolutions: once, by whom, and what is said if it can't be."""
 
+import configparser
 import os
+import pathlib
 import shutil
 import stat
 
@@ -58,6 +60,18 @@ def test_is_compiled_once_and_leaves_nothing_else(tmp_path):
     assert native.build(folder) == path
     assert path.stat().st_mtime_ns == when
     assert os.listdir(folder) == [path.name]
+
+
+def test_a_wheel_has_all_sources():
+    # Tests run from the tree, where a file that is not packed would not be missed.
+    root = pathlib.Path(native.__file__).parents[1]
+    setup = configparser.ConfigParser()
+    setup.read(root / "setup.cfg")
+    patterns = setup["options.package_data"]["jaxil"].split(",")
+    packed = {path for each in patterns for path in (root / "jaxil").glob(each.strip())}
+    sources = {*root.glob("jaxil/**/*.c"), *root.glob("jaxil/**/*.h")}
+    assert len(sources) > 1
+    assert sources <= packed
 
 
 def test_other_flags_are_another_library(tmp_path):
