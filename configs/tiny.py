@@ -58,6 +58,7 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     config.discriminator.gradient_penalty = _GRADIENT_PENALTIES.get(
         (method, task), config.discriminator.gradient_penalty
     )
+    config.reward_refresh_steps = 2_500
     config.sinkhorn.target_update_steps = 5_000
     config.sinkhorn.num_iterations = 50
     config.eval_every_frames = 10_000

@@ -57,6 +57,9 @@ def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Conf
 
     # Replay and schedule.
     config.replay_size_steps = 150_000  # also bounds how stale stored rewards get
+    # Agent steps between two recomputations of all stored rewards, at an episode's end;
+    # 0, as in the paper: an episode keeps the rewards that it got at its end.
+    config.reward_refresh_steps = 0
     config.batch_size = 256
     config.num_steps = 1 if task.startswith("walker") else 3  # of n-step returns
     config.discount_factor = 0.99
@@ -210,6 +213,7 @@ _RANGES: dict[str, tuple[float, float, str]] = {
         10**8,
         "it must hold whole episodes; 150000 in the paper",
     ),
+    "reward_refresh_steps": (0, 10**9, "0, the paper's, never recomputes rewards"),
     "batch_size": (1, 65_536, "256 in the paper"),
     "num_steps": (1, 100, "3 in the paper, 1 on walker tasks"),
     "discount_factor": (0.0, 1.0, "0.99 in the paper"),

@@ -43,6 +43,7 @@ from jaxil.networks.agent import AgentNetworks, make_agent_networks
 from jaxil.rewarders.adversarial import make_adversarial_rewarder
 from jaxil.rewarders.dac import make_dac_rewarder
 from jaxil.rewarders.matching import make_matching
+from jaxil.rewarders.refreshing import make_refresh
 from jaxil.rewarders.rewarder import Rewarder, Spec
 from jaxil.rewarders.sil import make_sil_rewarder
 from jaxil.rewarders.sinkhorn import make_sinkhorn_rewarder
@@ -66,6 +67,7 @@ class Agent(NamedTuple):
       explore_together: see `policy.make_explore_together`.
       exploit: see `policy.make_exploit`.
       rewards: the rewarder's, at episode end.
+      refresh: rewards of stored episodes as of now, see `refreshing.make_refresh`.
       plan: the rewarder's, for people; None where it has none.
       rewarder: the method itself.
       init_state: () -> the state before the first update.
@@ -77,6 +79,7 @@ class Agent(NamedTuple):
     explore_together: ExploreTogether
     exploit: Exploit
     rewards: Any
+    refresh: Any
     plan: Any
     rewarder: Rewarder
     init_state: Any
@@ -441,6 +444,7 @@ def make_agent(
         explore_together=jax.jit(make_explore_together(networks, schedule)),
         exploit=jax.jit(make_exploit(networks)),
         rewards=jax.jit(rewarder.rewards),
+        refresh=jax.jit(make_refresh(rewarder)),
         plan=None if rewarder.plan is None else jax.jit(rewarder.plan),
         rewarder=rewarder,
         # Compiled, and kept in the cache: one by one, its 450 operations take longer.

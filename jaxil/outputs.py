@@ -18,6 +18,7 @@ METRIC_COLUMNS = (
     "critic/value",
     "critic/target",
     "batch/reward",
+    "replay/reward",
     "actor/loss",
     "actor/pre_tanh",
     "exploration_std",

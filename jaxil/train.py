@@ -53,6 +53,7 @@ class Counters:
       num_evals: evaluations so far.
       last_eval_step: decision of the last evaluation.
       last_checkpoint_step: decision of the last checkpoint.
+      last_refresh_step: decision of the last recomputation of stored rewards.
       seconds: wall-clock of the run, earlier processes included.
     """
 
@@ -61,6 +62,7 @@ class Counters:
     num_evals: int = 0
     last_eval_step: int = 0
     last_checkpoint_step: int = 0
+    last_refresh_step: int = 0
     seconds: float = 0.0
 
 
@@ -308,14 +310,6 @@ class Run:
         self.stopwatch.timed("update", jax.block_until_ready)(self.state.num_updates)
         start = time.perf_counter()
         rewards = self.reward(episode)
-        self.stopwatch.reward_seconds += time.perf_counter() - start
-        self.stopwatch.seconds["update"] += time.perf_counter() - start
-        metrics = {name: float(value) for name, value in self.metrics.items()}
-        metrics |= {
-            name: float(value)
-            for name, value in self.agent.rewarder.summary(self.state.rewarder).items()
-        }
-        self.require_finite({**metrics, "imitation reward": float(np.sum(rewards))})
         self.replay.add_episode(
             frames=episode.frames,
             actions=episode.actions,
@@ -323,6 +317,18 @@ class Run:
             discounts=episode.discounts,
         )
         self.updates.episode_added()
+        if self.refresh_is_due():
+            self.updates.refresh_rewards(self.state)
+            self.counters.last_refresh_step = self.counters.num_steps
+        self.stopwatch.reward_seconds += time.perf_counter() - start
+        self.stopwatch.seconds["update"] += time.perf_counter() - start
+        metrics = {name: float(value) for name, value in self.metrics.items()}
+        metrics |= {
+            name: float(value)
+            for name, value in self.agent.rewarder.summary(self.state.rewarder).items()
+        }
+        metrics["replay/reward"] = self.replay.mean_reward()
+        self.require_finite(metrics)
         since_last_row = time.monotonic() - self.started - self.counters.seconds
         self.counters.seconds += since_last_row / (1 + len(later))
         self.returns = {
@@ -347,7 +353,17 @@ class Run:
             self.state.rewarder, self.state.params, _seen(episode), self.experts
         )
         self.state = self.state.replace(rewarder=rewarder)
+        self.require_finite({"imitation reward": float(np.sum(rewards))})
         return np.asarray(rewards)
+
+    def refresh_is_due(self) -> bool:
+        """Says whether all stored rewards are to be recomputed now."""
+        every, counters = self.config.reward_refresh_steps, self.counters
+        changed = self.agent.rewarder.rewards_changed
+        if every == 0 or changed is None:
+            return False
+        passed = counters.num_steps - counters.last_refresh_step
+        return passed >= every and bool(changed(self.state.rewarder))
 
     def require_finite(self, values: dict[str, float]) -> None:
         """Raises TrainingDiverged where a number is not finite."""

@@ -16,6 +16,8 @@ from jaxil.maths.types import Batch, ExpertBatch, ExpertEpisodes, Metrics, Windo
 
 Drawn = tuple[Batch | None, ExpertBatch | None]
 
+_REFRESH_EPISODES = 8  # in one call; bounds what leaves the host's memory at once
+
 
 class Updates:
     """Draws a batch for each update that is due, and runs so many at once.
@@ -45,6 +47,7 @@ class Updates:
         self._agent = agent
         self._replay = replay
         self._demonstrations = demonstrations
+        self._experts = experts
         self._pending: list[Drawn] = []
         self._clones = config.method == "bc"
         self._mirror: Mirror | None = None
@@ -93,6 +96,46 @@ class Updates:
         """Follows the replay, after an episode has entered it."""
         if self._mirror is not None:
             self._mirror.refresh()
+
+    def refresh_rewards(self, state: TrainState) -> None:
+        """Recomputes the rewards of all stored episodes with the rewarder as it is.
+
+        Args:
+          state: read; not donated.
+
+        Raises:
+          ValueError: a reward is not finite.
+        """
+        replay = self._replay
+        by_length: dict[int, list[int]] = {}
+        for index in range(replay.oldest_episode, replay.num_episodes_added):
+            by_length.setdefault(len(replay.slots(index)), []).append(index)
+        for indices in by_length.values():
+            for first in range(0, len(indices), _REFRESH_EPISODES):
+                chunk = indices[first : first + _REFRESH_EPISODES]
+                # Always of one size, so that it is compiled once for each length.
+                padded = chunk + chunk[-1:] * (_REFRESH_EPISODES - len(chunk))
+                rewards = self._refreshed(state, padded)[: len(chunk)]
+                for index, new in zip(chunk, rewards, strict=True):
+                    replay.replace_rewards(index, new)
+
+    def _refreshed(self, state: TrainState, indices: list[int]) -> np.ndarray:
+        slots = np.stack([self._replay.slots(index) for index in indices])
+        actions = np.stack([self._replay.actions(index) for index in indices])
+        if self._mirror is not None:
+            frames = self._mirror.frames
+        else:
+            frames = self._replay.frames[slots.ravel()]
+            slots = np.arange(slots.size).reshape(slots.shape)
+        rewards = self._agent.refresh(
+            state.rewarder,
+            state.params,
+            frames,
+            slots.astype(np.int32),
+            actions,
+            self._experts,
+        )
+        return np.asarray(rewards)
 
     def frames(self) -> Frames | None:
         """Returns the frames that lie on the device; None where none do.

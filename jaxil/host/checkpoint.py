@@ -30,6 +30,9 @@ from jaxil.host.replay import Replay
 _NUM_KEPT = 2  # the newest, and the one to fall back to
 _FORMAT = 1
 _CHECKSUMS = "checksums.json"
+# All stored rewards, in the order of their episodes: they may be newer than those in
+# the episodes' files, which never change.
+_REWARDS = "rewards.npy"
 # The second number tells two checkpoints of one frame apart (Ctrl-C after a save).
 _CHECKPOINT = re.compile(r"frame_(\d{12,})(?:_(\d+))?")
 _EPISODE = re.compile(r"episode_(\d{8,})\.npz")
@@ -105,11 +108,13 @@ class Checkpoints:
         oldest, added = replay.oldest_episode, replay.num_episodes_added
         for index in range(max(oldest, self._num_episodes_saved), added):
             _write_episode(self._episode_path(index), replay.episode(index))
+        rewards = [replay.rewards(index) for index in range(oldest, added)]
         path = self._free_path(frame)
         self._write(
             path,
             learner_state,
             {"counters": counters, "oldest_episode": oldest, "num_episodes": added},
+            np.concatenate([*rewards, np.zeros(0, np.float32)]),
         )
         self._last = path
         self._num_episodes_saved = added
@@ -152,6 +157,7 @@ class Checkpoints:
                     replay.clear(oldest)
                     for index in range(oldest, added):
                         _refill(replay, self._episode_path(index))
+                    _refill_rewards(replay, path / _REWARDS)
             except _Damaged as error:
                 faults.append(f"the checkpoint of frame {frame} is damaged ({error})")
                 continue
@@ -173,7 +179,13 @@ class Checkpoints:
             " from, start again in another --workdir"
         )
 
-    def _write(self, path: pathlib.Path, learner_state: Any, record: dict) -> None:
+    def _write(
+        self,
+        path: pathlib.Path,
+        learner_state: Any,
+        record: dict,
+        rewards: np.ndarray,
+    ) -> None:
         import orbax.checkpoint as ocp  # slow to import
 
         arrays, leaves = {}, {}
@@ -203,6 +215,7 @@ class Checkpoints:
                     record=ocp.args.JsonSave(record),
                 ),
             )
+        np.save(temporary / _REWARDS, rewards)
         checksums = json.dumps(_checksums(temporary))
         (temporary / _CHECKSUMS).write_text(checksums)
         os.replace(temporary, path)
@@ -366,6 +379,23 @@ def _refill(replay: Replay, path: pathlib.Path) -> None:
         zipfile.BadZipFile,
         zlib.error,
     ) as error:
+        raise _Damaged(f"{path.name}: {_one_line(error)}") from error
+
+
+def _refill_rewards(replay: Replay, path: pathlib.Path) -> None:
+    """Gives the replay's episodes the rewards that they had when they were saved."""
+    if not path.exists():  # a checkpoint from before rewards were part of it
+        return
+    try:
+        rewards = np.load(path, allow_pickle=False)
+        first = 0
+        for index in range(replay.oldest_episode, replay.num_episodes_added):
+            last = first + len(replay.rewards(index))
+            replay.replace_rewards(index, rewards[first:last])
+            first = last
+        if first != len(rewards):
+            raise ValueError(f"{len(rewards)} rewards for {first} steps")
+    except (OSError, ValueError, EOFError) as error:
         raise _Damaged(f"{path.name}: {_one_line(error)}") from error
 
 

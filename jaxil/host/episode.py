@@ -41,23 +41,44 @@ def checked_episode(frames, actions, rewards, discounts, *, like: Episode) -> Ep
         ("discounts", np.asarray(discounts), like.discounts),
     ):
         expected = (len(frames) - (name != "frames"), *ring.shape[1:])
-        require(array.shape == expected, f"{name}.shape", array.shape, expected)
         if name == "frames":
+            require(array.shape == expected, "frames.shape", array.shape, expected)
             same = array.dtype == ring.dtype
             require(same, "frames.dtype", array.dtype, ring.dtype)
+            _require_all(np.isfinite(array), name, array, "finite")
         else:
-            real = array.dtype.kind in "fiu"
-            require(real, f"{name}.dtype", array.dtype, "real numbers")
-            with np.errstate(over="ignore"):  # becomes inf, which is refused below
-                array = array.astype(ring.dtype)
-        good, rule = np.isfinite(array), "finite"
+            array = checked_values(name, array, np.empty(expected, ring.dtype))
         if name == "discounts":
-            good, rule = (array >= 0) & (array <= 1), "in [0, 1]"
-        if not good.all():
-            first = tuple(np.argwhere(~good)[0].tolist())
-            require(False, f"{name}{list(first)}", array[first], rule)
+            _require_all((array >= 0) & (array <= 1), name, array, "in [0, 1]")
         arrays.append(array)
     return Episode(*arrays)
+
+
+def checked_values(name: str, values, like: np.ndarray) -> np.ndarray:
+    """Returns finite real numbers in the type that is stored.
+
+    Args:
+      name: what an error calls them.
+      values: array, or what becomes one.
+      like: an array of the shape and the dtype that are expected.
+
+    Raises:
+      ValueError: for a wrong shape or dtype, or a number that is not finite.
+    """
+    values = np.asarray(values)
+    require(values.shape == like.shape, f"{name}.shape", values.shape, like.shape)
+    real = values.dtype.kind in "fiu"
+    require(real, f"{name}.dtype", values.dtype, "real numbers")
+    with np.errstate(over="ignore"):  # becomes inf, which is refused below
+        values = values.astype(like.dtype)
+    _require_all(np.isfinite(values), name, values, "finite")
+    return values
+
+
+def _require_all(good: np.ndarray, name: str, values: np.ndarray, rule: str) -> None:
+    if not good.all():
+        first = tuple(np.argwhere(~good)[0].tolist())
+        require(False, f"{name}{list(first)}", values[first], rule)
 
 
 def require(condition: bool, name: str, value: object, rule: object) -> None:

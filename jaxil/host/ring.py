@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxil.host.episode import Episode, checked_episode, require
+from jaxil.host.episode import Episode, checked_episode, checked_values, require
 
 
 class _Stored(NamedTuple):
@@ -146,6 +146,51 @@ class EpisodeRing:
         self._num_frames_stored += num_steps + 1
         self._num_episodes_added += 1
         self._index_episodes()
+
+    def replace_rewards(self, index: int, rewards) -> None:
+        """Gives one stored episode other rewards.
+
+        Args:
+          index: see `episode`.
+          rewards: [T] float, finite, for the T steps that the episode has.
+
+        Raises:
+          IndexError: if it is not stored.
+          ValueError: for a wrong shape or dtype, or a number that is not finite;
+            nothing is changed then.
+        """
+        slots = self.slots(index)[:-1]
+        self._rewards[slots] = checked_values("rewards", rewards, self._rewards[slots])
+
+    def rewards(self, index: int) -> np.ndarray:
+        """Copies the rewards of one stored episode out, [T].
+
+        Args:
+          index: see `episode`.
+
+        Raises:
+          IndexError: if it is not stored.
+        """
+        return self._rewards[self.slots(index)[:-1]]
+
+    def actions(self, index: int) -> np.ndarray:
+        """Copies the actions of one stored episode out, [T, A].
+
+        Args:
+          index: see `episode`.
+
+        Raises:
+          IndexError: if it is not stored.
+        """
+        return self._actions[self.slots(index)[:-1]]
+
+    def mean_reward(self) -> float:
+        """Returns the mean of all stored rewards; NaN without any."""
+        total = sum(
+            self.rewards(index).sum(dtype=np.float64)
+            for index in range(self.oldest_episode, self.num_episodes_added)
+        )
+        return float(total / self._num_steps_stored) if self._stored else math.nan
 
     def episode(self, index: int) -> Episode:
         """Copies one stored episode out.

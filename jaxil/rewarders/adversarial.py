@@ -105,4 +105,11 @@ def make_adversarial_rewarder(
         features = critic_features(networks, learner.encoder, learner.critic, judged)
         return logits(state.params, inputs(features, episode.actions)), state
 
-    return Rewarder(init, update, rewards, samples_expert=True, matches_episodes=False)
+    return Rewarder(
+        init,
+        update,
+        rewards,
+        samples_expert=True,
+        matches_episodes=False,
+        rewards_changed=lambda state: True,
+    )

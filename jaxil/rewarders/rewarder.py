@@ -64,6 +64,9 @@ class Rewarder(NamedTuple):
       summary: state -> scalars worth logging after an episode.
       relabel: (state, learner, window) -> rewards [B, n]. For methods that reward
         sampled transitions anew at each update; None where rewards are stored.
+      rewards_changed: state -> whether an episode rewarded before the last call of
+        `rewards` would get other rewards now: a bool or a bool array. None where
+        rewards never change, or are not read because `relabel` replaces them.
       plan: (state, learner, episode, expert_episodes) -> the transport plan
         [T + 1, N + 1] behind `rewards`, for people to look at; None without one.
     """
@@ -81,6 +84,7 @@ class Rewarder(NamedTuple):
     matches_episodes: bool
     summary: Callable[[RewarderState], Metrics] = lambda state: {}
     relabel: Callable[[RewarderState, LearnerParams, Window], Array] | None = None
+    rewards_changed: Callable[[RewarderState], Array | bool] | None = None
     plan: (
         Callable[[RewarderState, LearnerParams, Episode, ExpertEpisodes], Array] | None
     ) = None

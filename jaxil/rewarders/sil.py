@@ -142,6 +142,7 @@ def make_sil_rewarder(
         samples_expert=True,
         matches_episodes=True,
         summary=lambda state: {"sinkhorn/scale": state.scale},
+        rewards_changed=lambda state: True,
         plan=plan,
     )
 

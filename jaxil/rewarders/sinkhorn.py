@@ -138,5 +138,6 @@ def make_sinkhorn_rewarder(
         samples_expert=False,
         matches_episodes=True,
         summary=lambda state: {"sinkhorn/scale": state.scale},
+        rewards_changed=lambda state: state.steps_since_copy == 0,
         plan=plan,
     )
