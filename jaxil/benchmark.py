@@ -25,13 +25,13 @@ def main(argv: list[str]) -> None:
     """Runs the command."""
     values = command.parse(argv, __doc__ or "", _define)
     environment = dict(os.environ)  # as a new process would find it
-    from jaxil import platform
+    from jaxil.machine import startup
 
-    print(platform.prepare(), file=sys.stderr, flush=True)
-    from jaxil import experiment
+    print(startup.prepare(), file=sys.stderr, flush=True)
     from jaxil.timing import comparison, measurement, sweeping, tables
+    from jaxil.training import assembly
 
-    faults = experiment.problems(values.config) + _flag_problems(values)
+    faults = assembly.problems(values.config) + _flag_problems(values)
     if faults:
         raise command.UsageError(command.listing(faults))
     repeats, steps = values.repeats, values.steps
@@ -83,7 +83,7 @@ def _flag_problems(values: flags.FlagValues) -> list[str]:
 def _write(path: str | None, results: Any) -> None:
     if path is None:
         return
-    from jaxil.host.metrics import write_atomically
+    from jaxil.files.metrics import write_atomically
 
     try:
         write_atomically(path, (json.dumps(results, indent=2) + "\n").encode())

@@ -55,9 +55,9 @@ def main(argv: list[str]) -> None:
         faults += _output_faults(values)
     if faults:
         raise command.UsageError(command.listing(faults))
-    from jaxil import platform
+    from jaxil.machine import startup
 
-    print(platform.prepare(), file=sys.stderr, flush=True)
+    print(startup.prepare(), file=sys.stderr, flush=True)
     {"workdirs": _record, "inspect": _inspect, "convert": _convert}[jobs[0]](values)
 
 
@@ -65,9 +65,9 @@ def _record(values: flags.FlagValues) -> None:
     """Records the best of several policies."""
     import numpy as np
 
-    from jaxil import recording, trained
-    from jaxil.host import states
-    from jaxil.host.evaluation import evaluate
+    from jaxil.demonstrations import states
+    from jaxil.environments.evaluation import evaluate
+    from jaxil.training import recording, trained
 
     runs = [trained.load(pathlib.Path(folder)) for folder in values.workdirs]
     tasks = sorted({run.config.task for run in runs})
@@ -105,8 +105,8 @@ def _record(values: flags.FlagValues) -> None:
 
 def _inspect(values: flags.FlagValues) -> None:
     """Prints a summary; writes a contact sheet and a video."""
-    from jaxil import inspection
-    from jaxil.host.video import write_video
+    from jaxil.demonstrations import inspection
+    from jaxil.files.video import write_video
 
     path = pathlib.Path(values.inspect)
     with _told(path, f"--inspect={path}"):
@@ -134,9 +134,8 @@ def _inspect(values: flags.FlagValues) -> None:
 
 def _convert(values: flags.FlagValues) -> None:
     """Writes a file of any format as jaxil's own file of pixels."""
-    from jaxil import inspection
-    from jaxil.host import foreign, states
-    from jaxil.host.readers import own
+    from jaxil.demonstrations import foreign, inspection, states
+    from jaxil.demonstrations.readers import own
 
     path, output = pathlib.Path(values.convert), pathlib.Path(values.output)
     with _told(path, f"--convert={path} --output={output}"):
@@ -163,8 +162,8 @@ def _convert(values: flags.FlagValues) -> None:
 @contextlib.contextmanager
 def _told(path: pathlib.Path, flags_given: str) -> Iterator[None]:
     """Turns what may be wrong with a user's file into one message."""
-    from jaxil.host.readers.recording import FormatError
-    from jaxil.host.states import DemonstrationError
+    from jaxil.demonstrations.readers.recording import FormatError
+    from jaxil.demonstrations.states import DemonstrationError
 
     try:
         yield
@@ -208,9 +207,9 @@ def _named_output(argv: list[str]) -> list[str]:
 
 def _max_bytes() -> int:
     """Returns how much memory one array of a file may take."""
-    from jaxil import experiment
+    from jaxil.training import assembly
 
-    return experiment.spare_bytes()
+    return assembly.spare_bytes()
 
 
 def _define(values: flags.FlagValues) -> None:

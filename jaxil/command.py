@@ -218,9 +218,9 @@ def _value_problems(values: flags.FlagValues) -> list[str]:
     config = _config_of(values)
     if config is None:
         return []
-    from jaxil import platform
+    from jaxil.machine import startup
 
-    platform.prepare()
-    from jaxil import experiment
+    startup.prepare()
+    from jaxil.training import assembly
 
-    return experiment.problems(config)
+    return assembly.problems(config)

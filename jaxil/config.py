@@ -7,7 +7,7 @@ from typing import Any
 
 import ml_collections
 
-from jaxil.host import replay
+from jaxil.replay import replay
 
 # An ml_collections.ConfigDict, whose fields no type checker can know.
 Config = Any
@@ -86,7 +86,7 @@ def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Conf
     config.encoder.contrast = 1.0
     config.encoder.subtract_mean_image = False  # the demonstrations' mean, not 0.5
     # "auto" takes our own on CPUs with GCC, in float32, where channels come in 32s, and
-    # XLA's elsewhere; "native" and "xla" take these or nothing. See `jaxil.native`.
+    # XLA's elsewhere; "native" and "xla" take these or nothing. See `jaxil.native.build`.
     config.encoder.convolutions = "auto"
 
     config.demonstrations = ml_collections.ConfigDict()

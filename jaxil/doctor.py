@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxil import platform
+from jaxil.machine import startup
 
-_GL_INSTALL = f"apt-get install {' '.join(platform.GL_PACKAGES)}"
+_GL_INSTALL = f"apt-get install {' '.join(startup.GL_PACKAGES)}"
 _SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "software")
 # package: lowest version that works, first one that doesn't, and why
 _VERSIONS: dict[str, tuple[tuple[int, ...], tuple[int, ...], str]] = {
@@ -108,7 +108,7 @@ def gl_libraries() -> Iterator[Finding]:
 
 def rendering(config: Any) -> Iterator[Finding]:
     """Draws with the backend in force, at each quality, and times it."""
-    from jaxil.host.camera import RENDER_QUALITIES
+    from jaxil.environments.camera import RENDER_QUALITIES
 
     backend = os.environ.get("MUJOCO_GL", "")
     if backend in ("disable", "disabled", "off", "false", "0"):
@@ -128,7 +128,7 @@ def rendering(config: Any) -> Iterator[Finding]:
             return
     yield Finding("ok", "MUJOCO_GL", backend)
     is_software = any(word in name.lower() for word in _SOFTWARE_RENDERERS)
-    if is_software and platform.has_cuda_device():
+    if is_software and startup.has_cuda_device():
         yield Finding(
             "warning",
             "GL renderer",
@@ -159,7 +159,7 @@ def devices() -> Iterator[Finding]:
     value = f"{len(found)} x {found[0].device_kind} ({found[0].platform})"
     if found[0].platform != "cpu":
         yield Finding("ok", "jax devices", value)
-    elif platform.has_cuda_device():
+    elif startup.has_cuda_device():
         advice = "pip install 'jax[cuda12]', and unset JAX_PLATFORMS if it says cpu"
         value += f", {os.cpu_count()} cores, although there is a CUDA device"
         yield Finding("warning", "jax devices", value, advice)
@@ -171,11 +171,11 @@ def convolutions() -> Iterator[Finding]:
     """Compiles our own convolutions, where jax computes on the CPU."""
     import jax
 
-    from jaxil import native
+    from jaxil.native import build
 
     if jax.default_backend() != "cpu":
         return
-    problem = native.problem()
+    problem = build.problem()
     if problem is None:
         yield Finding("ok", "convolutions", "our own, compiled for this processor")
     else:
@@ -187,7 +187,7 @@ def convolutions() -> Iterator[Finding]:
 
 def memory(config: Any) -> Iterator[Finding]:
     """Compares the memory that is left with what the full replay will take."""
-    available = platform.available_memory_bytes()
+    available = startup.available_memory_bytes()
     if available is None:
         yield Finding("warning", "memory", "unknown here", "watch it yourself")
         return
@@ -195,9 +195,9 @@ def memory(config: Any) -> Iterator[Finding]:
         yield Finding("ok", "memory", f"{available / 1e9:.1f} GB available")
         return
     from jaxil import config as jaxil_config
-    from jaxil import machine
+    from jaxil.machine import provenance
 
-    needed = machine.host_memory_bytes(config)
+    needed = provenance.host_memory_bytes(config)
     value = (
         f"{available / 1e9:.1f} GB available, {needed / 1e9:.2f} GB for the replay of "
         f"{config.replay_size_steps} steps"
@@ -218,13 +218,16 @@ def memory(config: Any) -> Iterator[Finding]:
 def _device_memory(config: Any) -> Iterator[Finding]:
     """Compares a device's memory with the copy of the replay's frames on it."""
     from jaxil import config as jaxil_config
-    from jaxil import machine
+    from jaxil.machine import provenance
 
-    needed, free = jaxil_config.device_memory_bytes(config), machine.free_device_bytes()
+    needed, free = (
+        jaxil_config.device_memory_bytes(config),
+        provenance.free_device_bytes(),
+    )
     if not needed or free is None:  # a CPU's copy is counted with the replay
         return
     value = (
-        f"{free / 1e9:.1f} GB free on {machine.device_name()}, {needed / 1e9:.2f} GB "
+        f"{free / 1e9:.1f} GB free on {provenance.device_name()}, {needed / 1e9:.2f} GB "
         "for the copy of the replay"
     )
     fits = needed + _DEVICE_MARGIN <= free
@@ -236,7 +239,7 @@ def _device_memory(config: Any) -> Iterator[Finding]:
 
 def demonstrations(config: Any) -> Iterator[Finding]:
     """Reads the shipped demonstrations, and those of `config`, and draws a little."""
-    from jaxil.host import states
+    from jaxil.demonstrations import states
 
     shipped = states.shipped_tasks()
     if not shipped:
@@ -247,11 +250,11 @@ def demonstrations(config: Any) -> Iterator[Finding]:
     if config is None:
         return
     from jaxil import config as jaxil_config
-    from jaxil import experiment
+    from jaxil.training import assembly
 
     if not jaxil_config.uses_demonstrations(config):
         return
-    fault = experiment.demonstration_fault(config)
+    fault = assembly.demonstration_fault(config)
     source = pathlib.Path(config.demonstrations.source)
     if fault is not None:
         yield Finding("fault", "demonstrations", fault)
@@ -262,8 +265,8 @@ def demonstrations(config: Any) -> Iterator[Finding]:
 
 
 def _try_demonstrations(path: pathlib.Path, task: str) -> Finding:
-    from jaxil.host import rendering as drawing
-    from jaxil.host import states
+    from jaxil.demonstrations import rendering as drawing
+    from jaxil.demonstrations import states
 
     try:
         stored = states.read_states(path, task=task)
@@ -291,9 +294,9 @@ def _try_demonstrations(path: pathlib.Path, task: str) -> Finding:
 
 def _frame_milliseconds(task: str, image_size: int, quality: str) -> tuple[str, float]:
     """Returns the GL renderer's name and the time of one image."""
-    from jaxil.host import environment as environments
+    from jaxil.environments import suite
 
-    environment = environments.make_environment(
+    environment = suite.make_environment(
         task, seed=0, image_size=image_size, render_quality=quality, observation="state"
     )
     try:
@@ -331,7 +334,7 @@ def _read_config(argv: list[str]) -> Any:
     """
     from jaxil import command
     from jaxil import config as jaxil_config
-    from jaxil.host import environment as environments
+    from jaxil.environments import suite
 
     gives_config = any(word.lstrip("-").startswith("config") for word in argv[1:])
 
@@ -342,7 +345,7 @@ def _read_config(argv: list[str]) -> Any:
     values = command.parse(argv, __doc__ or "", define)
     given: Any = values["config"].value if gives_config else None
     config = jaxil_config.default_config() if given is None else given
-    faults = jaxil_config.problems(config, environments.known_tasks())
+    faults = jaxil_config.problems(config, suite.known_tasks())
     if faults:
         raise command.UsageError(command.listing(faults))
     return config
@@ -350,7 +353,7 @@ def _read_config(argv: list[str]) -> Any:
 
 def main(argv: list[str]) -> int:
     """Prints the findings and returns the exit status."""
-    said = platform.prepare()
+    said = startup.prepare()
     try:
         config = _read_config(argv)
     except (ImportError, AttributeError) as error:  # a broken jax or simulator

@@ -24,14 +24,14 @@ def main(argv: list[str]) -> None:
         raise command.UsageError(
             "--workdir is missing: name the folder of a run, such as --workdir=runs/1"
         )
-    from jaxil import platform
+    from jaxil.machine import startup
 
-    print(platform.prepare(), file=sys.stderr, flush=True)
+    print(startup.prepare(), file=sys.stderr, flush=True)
     import numpy as np
 
-    from jaxil import outputs, trained
-    from jaxil.host.evaluation import evaluate
-    from jaxil.host.video import write_video
+    from jaxil.environments.evaluation import evaluate
+    from jaxil.files.video import write_video
+    from jaxil.training import run_log, trained
 
     folder = pathlib.Path(values.workdir)
     run = trained.load(folder)
@@ -65,7 +65,7 @@ def main(argv: list[str]) -> None:
         path,
         evaluation.video,
         expert_frames,
-        fps=outputs.frames_per_second(len(evaluation.video)),
+        fps=run_log.frames_per_second(len(evaluation.video)),
     )
     print(f"video: {path}")
 

@@ -23,24 +23,26 @@ def main(argv: list[str]) -> int:
             "--workdir is missing: name a folder for the run, such as --workdir=runs/1"
         )
     # Before jax and MuJoCo are imported, which the imports below do.
-    from jaxil import platform
+    from jaxil.machine import startup
 
-    print(platform.prepare(), file=sys.stderr, flush=True)
+    print(startup.prepare(), file=sys.stderr, flush=True)
 
-    from jaxil import experiment, machine, train, workdir
-    from jaxil.host.pool import EnvironmentsFailed
+    from jaxil import train
+    from jaxil.environments.pool import EnvironmentsFailed
+    from jaxil.machine import provenance
+    from jaxil.training import assembly, workdir
 
     config = values.config
     folder = pathlib.Path(values.workdir)
-    faults = experiment.problems(config) + workdir.problems(folder, config)
+    faults = assembly.problems(config) + workdir.problems(folder, config)
     if faults:
         raise command.UsageError(command.listing(faults))
-    print(machine.memory_sentence(config), file=sys.stderr, flush=True)
+    print(provenance.memory_sentence(config), file=sys.stderr, flush=True)
     with workdir.opened(folder):
         try:
-            gl_name = experiment.renderer_name(config)
-            native = experiment.uses_native_convolutions(config)
-            description = machine.describe(gl_name, native=native)
+            gl_name = assembly.renderer_name(config)
+            native = assembly.uses_native_convolutions(config)
+            description = provenance.describe(gl_name, native=native)
             workdir.write_config(folder, config, description)
             finished = train.train(config, folder)
         except (train.TrainingDiverged, EnvironmentsFailed) as error:

@@ -12,26 +12,26 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxil import experiment, outputs
-from jaxil.closeness import Closeness
 from jaxil.config import METHODS, Config
-from jaxil.host import demonstrations as host_demonstrations
-from jaxil.host.checkpoint import Checkpoints
-from jaxil.host.evaluation import evaluate
-from jaxil.host.interaction import (
+from jaxil.demonstrations import loading
+from jaxil.environments.evaluation import evaluate
+from jaxil.environments.interaction import (
     Decision,
     FinishedEpisode,
     interact,
     interact_together,
     join,
 )
-from jaxil.host.pool import EnvironmentsFailed
-from jaxil.host.progress import ProgressLine
-from jaxil.host.signals import StopOnSignals
-from jaxil.host.stopwatch import Stopwatch, TimedEnvironment, TimedPool
+from jaxil.environments.pool import EnvironmentsFailed
 from jaxil.learner.state import TrainState
+from jaxil.machine.progress import ProgressLine
+from jaxil.machine.signals import StopOnSignals
 from jaxil.maths.types import Episode
-from jaxil.updates import Updates
+from jaxil.training import assembly, run_log
+from jaxil.training.checkpoint import Checkpoints
+from jaxil.training.expert_distance import Closeness
+from jaxil.training.stopwatch import Stopwatch, TimedEnvironment, TimedPool
+from jaxil.training.updates import Updates
 
 # Names of NumPy's random streams: every draw is keyed by (seed, stream, step), so
 # that a resumed run repeats those of an unbroken one without any stored state.
@@ -73,18 +73,18 @@ class Run:
         self,
         config: Config,
         workdir: pathlib.Path,
-        demonstrations: host_demonstrations.Demonstrations | None,
+        demonstrations: loading.Demonstrations | None,
         say: Callable[[str], None],
     ) -> None:
         """Makes the parts and goes on from the newest checkpoint, if there is one."""
         self.config = config
         self.demonstrations = demonstrations
         self.say = say
-        self.environment = experiment.training_environment(config)
-        self.eval_environment = experiment.evaluation_environment(config)
-        self.agent = experiment.make_agent(config, self.environment, demonstrations)
-        self.replay = experiment.make_replay(config, self.environment)
-        self.experts = experiment.expert_episodes(self.agent.rewarder, demonstrations)
+        self.environment = assembly.training_environment(config)
+        self.eval_environment = assembly.evaluation_environment(config)
+        self.agent = assembly.make_agent(config, self.environment, demonstrations)
+        self.replay = assembly.make_replay(config, self.environment)
+        self.experts = assembly.expert_episodes(self.agent.rewarder, demonstrations)
         self.closeness = None
         if demonstrations is not None:
             self.closeness = Closeness(config, workdir, demonstrations)
@@ -104,9 +104,9 @@ class Run:
         )
         self.started = time.monotonic() - self.counters.seconds
         resumed = self.frame if self.counters.num_steps else None
-        self.outputs = outputs.Outputs(workdir, config, demonstrations, resumed)
+        self.outputs = run_log.Outputs(workdir, config, demonstrations, resumed)
         self.progress = ProgressLine(config.total_frames, first_frame=self.frame)
-        self.pool = experiment.training_pool(
+        self.pool = assembly.training_pool(
             config, self.environment, lambda text: self.say(text)
         )
 
@@ -480,7 +480,7 @@ class Run:
         if self.checkpoints.newest() is None:
             return self.agent.init_state()
         state, counters = self.checkpoints.restore(
-            experiment.abstract_state(self.agent), self.replay
+            assembly.abstract_state(self.agent), self.replay
         )
         self.counters = Counters(**counters)
         self.say(f"going on from the checkpoint of frame {self.frame}")
@@ -510,7 +510,7 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
     def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
-    demonstrations = experiment.load_demonstrations(config)
+    demonstrations = assembly.load_demonstrations(config)
     say(f"{config.task}: {METHODS[config.method]}, seed {config.seed}")
     run = Run(config, workdir, demonstrations, say)
     run.say = run.progress.message

@@ -25,7 +25,9 @@ sys.path[0] = str(pathlib.Path(__file__).resolve().parent.parent)
 
 from absl import flags  # noqa: E402
 
-from jaxil import command, figures, platform  # noqa: E402
+from jaxil import command  # noqa: E402
+from jaxil.machine import startup  # noqa: E402
+from jaxil.reporting import figures  # noqa: E402
 from launch.sweeps import clusters, cost, faults, plan, slurm, state, tables  # noqa: E402
 from launch.sweeps.state import State, Status  # noqa: E402
 
@@ -136,10 +138,10 @@ def _checked_runs(
     )
     runs = []
     with _checking_environment():
-        from jaxil import experiment
+        from jaxil.training import assembly
 
         try:
-            runs = plan.make_runs(request, experiment.problems)
+            runs = plan.make_runs(request, assembly.problems)
         except faults.Faulty as error:
             sentences += error.sentences
     if sentences:
@@ -154,7 +156,7 @@ def _checking_environment() -> Iterator[None]:
     A run finds out for itself: it may be made on another machine.
     """
     before = dict(os.environ)
-    platform.prepare()
+    startup.prepare()
     try:
         yield
     finally:

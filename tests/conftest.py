@@ -4,10 +4,10 @@ import os
 import signal
 
 # Before jax and MuJoCo are imported anywhere: flags and GL are read only once.
-from jaxil import platform
+from jaxil.machine import startup
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-platform.prepare()
+startup.prepare()
 
 # A shell that starts the tests in the background has them ignore Ctrl-C, nohup has them
 # ignore hang-ups, and so would all programs whose signals are tested.

@@ -10,11 +10,11 @@ import imageio.v3
 import numpy as np
 import pytest
 
-from jaxil import collect, inspection
+from jaxil import collect
 from jaxil.command import UsageError
-from jaxil.host import demonstrations, foreign, states
+from jaxil.demonstrations import foreign, inspection, loading, states
 from tests.commands import ROOT, arguments, run
-from tests.host import foreign_files
+from tests.demonstrations import foreign_files
 
 SHIPPED = states.shipped_path("cartpole_swingup")
 SIZES = ("--image_size=16", "--render_quality=fast")
@@ -115,7 +115,7 @@ def test_states_become_pixels_that_serve_as_the_states_do(few, tmp_path, capsys)
         "image_size": 16,
         "render_quality": "fast",
     }
-    one, other = (demonstrations.load(path, **settings) for path in (few, output))
+    one, other = (loading.load(path, **settings) for path in (few, output))
     np.testing.assert_array_equal(one.frames, other.frames)
     np.testing.assert_array_equal(one.actions, other.actions)
     np.testing.assert_allclose(

@@ -6,10 +6,11 @@ import os
 import pytest
 
 from jaxil import config as jaxil_config
-from jaxil import doctor, machine, platform
+from jaxil import doctor
 from jaxil.command import UsageError
-from jaxil.host import environment as environments
-from jaxil.host import states
+from jaxil.demonstrations import states
+from jaxil.environments import suite
+from jaxil.machine import provenance, startup
 
 
 @pytest.fixture(autouse=True)
@@ -107,7 +108,7 @@ def test_nothing_renders(monkeypatch, config):
         raise RuntimeError("nothing here can render")
 
     monkeypatch.setenv("MUJOCO_GL", "egl")
-    monkeypatch.setattr(environments, "make_environment", fail)
+    monkeypatch.setattr(suite, "make_environment", fail)
     finding = one(doctor.rendering(config), "MUJOCO_GL")
     assert (finding.level, "egl" in finding.value) == ("fault", True)
     assert "apt-get install" in finding.advice
@@ -126,7 +127,7 @@ def test_software_beside_a_device_is_warned_of(
     monkeypatch, config, renderer, has_cuda, level
 ):
     monkeypatch.setattr(doctor, "_frame_milliseconds", lambda *_: (renderer, 1.0))
-    monkeypatch.setattr(platform, "has_cuda_device", lambda: has_cuda)
+    monkeypatch.setattr(startup, "has_cuda_device", lambda: has_cuda)
     finding = one(doctor.rendering(config), "GL renderer")
     assert finding.level == level
     assert renderer in finding.value
@@ -145,7 +146,7 @@ def test_slow_frames_are_warned_of_where_they_are_used(monkeypatch, config):
 
 
 def test_jax_on_the_cpu_beside_a_device_is_warned_of(monkeypatch):
-    monkeypatch.setattr(platform, "has_cuda_device", lambda: True)
+    monkeypatch.setattr(startup, "has_cuda_device", lambda: True)
     finding = one(doctor.devices(), "jax devices")
     assert finding.level == "warning"
     assert "jax[cuda12]" in finding.advice
@@ -156,16 +157,16 @@ def test_memory_is_compared_with_the_replay(monkeypatch, config):
     levels = {}
     for available in (0.5 * needed, needed + 1e9, needed + 4e9):
         monkeypatch.setattr(
-            platform, "available_memory_bytes", lambda bytes=available: int(bytes)
+            startup, "available_memory_bytes", lambda bytes=available: int(bytes)
         )
         levels[available] = one(doctor.memory(config), "memory").level
     assert list(levels.values()) == ["fault", "warning", "ok"]
-    monkeypatch.setattr(platform, "available_memory_bytes", lambda: None)
+    monkeypatch.setattr(startup, "available_memory_bytes", lambda: None)
     assert one(doctor.memory(config), "memory").level == "warning"
 
 
 def test_states_take_little_memory(monkeypatch, config):
-    monkeypatch.setattr(platform, "available_memory_bytes", lambda: int(1e9))
+    monkeypatch.setattr(startup, "available_memory_bytes", lambda: int(1e9))
     config.observation = "state"
     assert one(doctor.memory(config), "memory").level == "ok"
 
@@ -176,24 +177,26 @@ def test_a_copy_on_the_device_is_counted_where_it_lies(monkeypatch, config):
     frames = jaxil_config.device_memory_bytes(config)
     # 150000 steps in 300 episodes of 500: one frame more in each.
     assert frames == 150_300 * 48 * 48 * 3
-    monkeypatch.setattr(platform, "available_memory_bytes", lambda: int(plain + 2e9))
-    monkeypatch.setattr(machine, "device_name", lambda: "cpu: cpu")
-    monkeypatch.setattr(machine, "free_device_bytes", lambda: None)
+    monkeypatch.setattr(startup, "available_memory_bytes", lambda: int(plain + 2e9))
+    monkeypatch.setattr(provenance, "device_name", lambda: "cpu: cpu")
+    monkeypatch.setattr(provenance, "free_device_bytes", lambda: None)
     assert one(doctor.memory(config), "memory").level == "warning"  # there twice
-    assert "another 1.04 GB" in machine.memory_sentence(config)
-    monkeypatch.setattr(machine, "device_name", lambda: "gpu: NVIDIA H100")
+    assert "another 1.04 GB" in provenance.memory_sentence(config)
+    monkeypatch.setattr(provenance, "device_name", lambda: "gpu: NVIDIA H100")
     for free, level in ((1e9, "fault"), (10e9, "ok")):
-        monkeypatch.setattr(machine, "free_device_bytes", lambda free=free: int(free))
+        monkeypatch.setattr(
+            provenance, "free_device_bytes", lambda free=free: int(free)
+        )
         found = list(doctor.memory(config))
         assert one(found, "memory").level == "ok"
         assert one(found, "device memory").level == level
         assert "NVIDIA H100" in one(found, "device memory").value
-    assert "gpu: NVIDIA H100" in machine.memory_sentence(config)
+    assert "gpu: NVIDIA H100" in provenance.memory_sentence(config)
 
 
 def test_the_advised_replay_fits(monkeypatch, config):
     config.replay_size_steps = 10_000_000
-    monkeypatch.setattr(platform, "available_memory_bytes", lambda: int(4e9))
+    monkeypatch.setattr(startup, "available_memory_bytes", lambda: int(4e9))
     advice = one(doctor.memory(config), "memory").advice
     field, _, rest = advice.removeprefix("--config.").partition("=")
     config[field] = int(rest.split(",")[0])

@@ -7,8 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from jaxil.host import states
-from jaxil.host.environment import make_environment
+from jaxil.demonstrations import states
+from jaxil.environments.suite import make_environment
 from tests.commands import ROOT
 
 _FOLDER = ROOT / "launch" / "experts"

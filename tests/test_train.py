@@ -10,8 +10,8 @@ import pytest
 
 from jaxil import config as jaxil_config
 from jaxil import train
-from jaxil.host.interaction import Decision, Moment, interact, join
-from jaxil.host.pool import EnvironmentsFailed
+from jaxil.environments.interaction import Decision, Moment, interact, join
+from jaxil.environments.pool import EnvironmentsFailed
 
 _EPISODE_STEPS = 3
 

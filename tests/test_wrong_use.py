@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from jaxil import config as jaxil_config
-from jaxil import experiment
-from jaxil.host import states
+from jaxil.demonstrations import states
+from jaxil.training import assembly
 from tests.commands import run, small_run
 
 _TASKS = ("walker_walk", "cartpole_swingup")
@@ -118,13 +118,13 @@ def test_demonstrations_are_checked_before_anything_starts(tmp_path):
     }
     for source, expected in sources.items():
         config.demonstrations.source = source
-        faults = experiment.problems(config)
+        faults = assembly.problems(config)
         assert len(faults) == 1
         assert expected in faults[0]
 
     config = jaxil_config.default_config("pdac", "ball_in_cup_catch")
     config.demonstrations.num_episodes = 10_000
-    (fault,) = experiment.problems(config)
+    (fault,) = assembly.problems(config)
     assert "10000" in fault
 
 

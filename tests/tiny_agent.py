@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxil.learner.rewarder import Spec
 from jaxil.learner.state import LearnerParams
 from jaxil.maths.types import Episode
 from jaxil.networks.agent import AgentNetworks, apply, make_agent_networks
-from jaxil.rewarders.rewarder import Spec
 
 SIDE, ACTION_DIM, FEATURE_DIM = 12, 2, 5
 # For methods that share no network with the agent.

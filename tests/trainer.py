@@ -11,10 +11,10 @@ import signal
 import sys
 import time
 
-from jaxil import workdir
 from jaxil.command import UsageError
-from jaxil.host.metrics import CsvLog
-from jaxil.host.signals import StopOnSignals
+from jaxil.files.metrics import CsvLog
+from jaxil.machine.signals import StopOnSignals
+from jaxil.training import workdir
 from launch.sweeps.plan import Run
 from launch.sweeps.worker import HAS_HEARD
 

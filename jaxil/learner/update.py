@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from jaxil.learner.rewarder import AgentView, Rewarder, Spec
 from jaxil.learner.state import (
     LearnerParams,
     TrainState,
@@ -19,7 +20,6 @@ from jaxil.learner.state import (
 from jaxil.maths import augmentation, distributions, losses
 from jaxil.maths.types import Batch, Data, ExpertBatch, Metrics, Params
 from jaxil.networks.agent import AgentNetworks, apply
-from jaxil.rewarders.rewarder import AgentView, Rewarder, Spec
 
 UpdateStep = Callable[
     [TrainState, Batch, ExpertBatch | None], tuple[TrainState, Metrics]

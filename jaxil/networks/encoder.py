@@ -7,7 +7,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jax import Array
 
-from jaxil.maths import encoding
+from jaxil.native import encoding
 from jaxil.networks.layers import ConvolutionReLU, dense
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxil.maths import convolution, products
-from jaxil.maths.encoding import Weights
+from jaxil.native.encoding import Weights
 
 _LAYER_NORM_EPSILON = 1e-5  # PyTorch's default; flax's own is 1e-6
 

@@ -4,7 +4,7 @@ import colorsys
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from jaxil import figures
+from jaxil.reporting import figures
 from jaxil.reporting.groups import Group, label_order
 
 # Okabe and Ito's palette, told apart also by colour-blind readers.

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxil import figures
+from jaxil.reporting import figures
 from jaxil.reporting.runs import Run, paper_settings
 
 # Runs that differ in nothing else are seeds of one thing. From the third on they decide

@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxil.host import statistics
-from jaxil.host.statistics import Estimate
+from jaxil.reporting import statistics
 from jaxil.reporting.groups import Group
 from jaxil.reporting.runs import Run, Table
+from jaxil.reporting.statistics import Estimate
 
 LEVELS = (0.5, 0.8, 0.9)  # of the expert's return
 # More than a figure's width can show.

@@ -7,8 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from jaxil import figures
-from jaxil.reporting import sheets
+from jaxil.reporting import figures, sheets
 from jaxil.reporting.episodes import Episode, return_at
 from jaxil.reporting.folder import MARK
 from jaxil.reporting.paper import PaperFigure

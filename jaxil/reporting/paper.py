@@ -2,8 +2,7 @@
 
 from typing import NamedTuple
 
-from jaxil import figures
-from jaxil.reporting import results
+from jaxil.reporting import figures, results
 from jaxil.reporting.groups import Group
 from jaxil.reporting.results import Study
 from jaxil.reporting.sheets import Sheet

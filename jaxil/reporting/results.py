@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxil.host import statistics
-from jaxil.reporting import measures, plots
+from jaxil.reporting import measures, plots, statistics
 from jaxil.reporting.appearance import Look, looks
 from jaxil.reporting.groups import Group, changes, expert_returns, tasks_of
 from jaxil.reporting.measures import LEVELS, Curve, Final

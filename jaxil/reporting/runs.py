@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxil import config as jaxil_config
-from jaxil import figures
-from jaxil.host import metrics
+from jaxil.files import metrics
+from jaxil.reporting import figures
 
 # Large folders of a run in which no other run can be.
 _OWN_FOLDERS = ("checkpoints", "replay", "tensorboard", "videos")

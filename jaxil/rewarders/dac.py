@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from jaxil.learner.rewarder import AgentView, Rewarder, Spec
 from jaxil.learner.state import LearnerParams, ModuleState, init_module
 from jaxil.maths import augmentation
 from jaxil.maths.types import (
@@ -20,7 +21,6 @@ from jaxil.networks.agent import AgentNetworks, apply
 from jaxil.networks.discriminator import PixelDiscriminator
 from jaxil.networks.encoder import PixelEncoder
 from jaxil.rewarders.discrimination import update_discriminator
-from jaxil.rewarders.rewarder import AgentView, Rewarder, Spec
 
 Inputs = tuple[Array, Array]  # pixels in [0, 1], float [B, H, W, C]; actions [B, A]
 

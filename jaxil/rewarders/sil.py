@@ -7,6 +7,7 @@ import optax
 from flax import struct
 from jax import Array
 
+from jaxil.learner.rewarder import AgentView, Rewarder, Spec
 from jaxil.learner.state import (
     LearnerParams,
     ModuleState,
@@ -18,7 +19,6 @@ from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes, Metrics, Par
 from jaxil.networks.agent import AgentNetworks, apply
 from jaxil.networks.discriminator import Embedding
 from jaxil.rewarders.matching import Matching
-from jaxil.rewarders.rewarder import AgentView, Rewarder, Spec
 
 
 class SilState(struct.PyTreeNode):

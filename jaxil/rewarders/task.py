@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 from jax import Array
 
+from jaxil.learner.rewarder import Rewarder, RewarderState, Spec, keep_state
 from jaxil.learner.state import LearnerParams
 from jaxil.maths.types import Episode, ExpertEpisodes
-from jaxil.rewarders.rewarder import Rewarder, RewarderState, Spec, keep_state
 
 
 def make_task_rewarder() -> Rewarder:

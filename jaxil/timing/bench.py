@@ -11,14 +11,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxil import experiment, train
+from jaxil import train
 from jaxil.config import Config
-from jaxil.host.evaluation import evaluate
-from jaxil.host.interaction import FinishedEpisode
-from jaxil.host.progress import ProgressLine
+from jaxil.environments.evaluation import evaluate
+from jaxil.environments.interaction import FinishedEpisode
 from jaxil.learner.gathering import gather_batch, gather_expert
+from jaxil.machine.progress import ProgressLine
 from jaxil.maths.types import Batch, ExpertBatch
 from jaxil.timing.parts import make_parts
+from jaxil.training import assembly
 
 _EPISODE_STEPS = 500  # of tasks that have no limit of their own
 _DRAWN_FRAMES = 20  # of a made-up episode; 500 take longer than all else here
@@ -131,9 +132,9 @@ class Bench:
             batch = jax.jit(gather_batch)(frames.agent, batch)
         if frames is not None and expert is not None:
             expert = jax.jit(gather_expert)(frames.expert, expert)
-        mean = experiment.mean_image(config, run.demonstrations)
+        mean = assembly.mean_image(config, run.demonstrations)
         return make_parts(
-            experiment.make_networks(config, self.episode.actions.shape[1], mean),
+            assembly.make_networks(config, self.episode.actions.shape[1], mean),
             run.agent.rewarder,
             # Of its own, because each update deletes the state that it was given.
             jax.tree.map(jnp.copy, run.state),
@@ -155,7 +156,7 @@ class Bench:
         config = run.config.copy_and_resolve_references()
         with config.unlocked():
             config.encoder.convolutions = "xla"
-        agent = experiment.make_agent(config, run.environment, run.demonstrations)
+        agent = assembly.make_agent(config, run.environment, run.demonstrations)
         return self._lower(agent.update_step)
 
     def _lower(self, step: Any) -> Any:

@@ -11,12 +11,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxil import experiment
 from jaxil.config import Config
-from jaxil.host import replay as host_replay
+from jaxil.replay import replay
 from jaxil.timing import arithmetic, compiling, device, start
 from jaxil.timing.bench import Bench, make_bench
 from jaxil.timing.clock import timed
+from jaxil.training import assembly
 
 _TURNS = 4  # of the loop's two forms
 _UPDATE_PARTS = ("encoder", "critic", "actor", "rewarder", "optimiser")
@@ -45,7 +45,7 @@ def measure(
       What `tables.ROWS` names, None where it does not apply; `ranges`, lowest and
       highest by name; what it was measured on; the config.
     """
-    demonstrations = experiment.load_demonstrations(config)
+    demonstrations = assembly.load_demonstrations(config)
     with tempfile.TemporaryDirectory() as folder:
         bench = make_bench(config, pathlib.Path(folder), demonstrations, say=_say)
         with contextlib.closing(bench.run):
@@ -109,7 +109,7 @@ def _time_parts(
 
 def _physics_step(config: Config) -> Callable[[], Any]:
     # State vectors are read, nothing is drawn.
-    environment = experiment.training_environment(_with(config, observation="state"))
+    environment = assembly.training_environment(_with(config, observation="state"))
     environment.reset(episode=0)
     action = np.zeros(environment.action_spec().shape)
     return lambda: environment.step(action)
@@ -155,7 +155,7 @@ def _before_the_first_step(
 
 def _memory(bench: Bench) -> dict[str, float | None]:
     run, frames, actions = bench.run, bench.episode.frames, bench.episode.actions
-    full = host_replay.memory_bytes(
+    full = replay.memory_bytes(
         capacity_steps=run.config.replay_size_steps,
         episode_steps=len(actions),
         observation_shape=frames.shape[1:],

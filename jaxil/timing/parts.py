@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from jaxil.learner.rewarder import AgentView, Rewarder
 from jaxil.learner.state import TrainState, apply_gradients
 from jaxil.maths import augmentation, distributions, losses
 from jaxil.maths.types import Batch, Data, ExpertBatch, Params
 from jaxil.networks.agent import AgentNetworks, apply
-from jaxil.rewarders.rewarder import AgentView, Rewarder
 
 _STD = 0.1  # of exploration; its value costs nothing
 

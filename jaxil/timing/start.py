@@ -67,17 +67,17 @@ def main(config_file: str, workdir: str) -> None:
     Prints `time.monotonic()` of that moment, a clock that all processes share, and ends
     this one at once.
     """
-    from jaxil import platform
+    from jaxil.machine import startup
 
-    platform.prepare()
+    startup.prepare()
     from jaxil import command, launch
-    from jaxil.host import environment
+    from jaxil.environments import suite
 
-    def step(self: environment.PixelEnvironment, action: Any) -> Any:
+    def step(self: suite.PixelEnvironment, action: Any) -> Any:
         print(json.dumps(time.monotonic()), flush=True)
         os._exit(0)
 
-    environment.PixelEnvironment.step = step
+    suite.PixelEnvironment.step = step
     sys.argv = ["launch", f"--config={config_file}", f"--workdir={workdir}/run"]
     command.run(launch.main)
 

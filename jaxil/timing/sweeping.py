@@ -3,9 +3,9 @@
 from typing import Any, NamedTuple
 
 from jaxil import config as jaxil_config
-from jaxil import experiment
 from jaxil.command import UsageError, listing
 from jaxil.config import Config
+from jaxil.training import assembly
 
 _EXAMPLE = "such as --sweep=batch_size:64,128,256"
 
@@ -47,9 +47,7 @@ def parse(text: str, config: Config) -> Sweep:
             continue
         configs[value] = _with(config, field, value)
         faults += [
-            fault
-            for fault in experiment.problems(configs[value])
-            if fault not in faults
+            fault for fault in assembly.problems(configs[value]) if fault not in faults
         ]
     if faults:
         raise UsageError(listing(faults))

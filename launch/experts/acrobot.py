@@ -17,7 +17,7 @@ import studio
 from acrobot_model import Arm
 from acrobot_planner import Effort, control, search
 
-from jaxil import platform
+from jaxil.machine import startup
 
 TASK = "acrobot_swingup"
 _SEARCH_EVERY_STEPS = 50
@@ -27,7 +27,7 @@ LATER = Effort(draws=4000, variations=1500, rounds=1, exact=60)
 
 
 def record(num_episodes: int, *, first: Effort = FIRST, later: Effort = LATER) -> Any:
-    """Plays episodes and returns them as `jaxil.host.states.StateDemonstrations`.
+    """Plays episodes and returns them as `StateDemonstrations`.
 
     Each episode's draws depend on its number alone. Progress goes to stderr.
 
@@ -82,7 +82,7 @@ def main(argv: list[str]) -> None:
     """Runs the command."""
     parser = studio.Parser(__doc__)
     values = parser.parse_args(argv)
-    print(platform.prepare(), file=sys.stderr, flush=True)
+    print(startup.prepare(), file=sys.stderr, flush=True)
     studio.write(parser, values.output, lambda: record(values.num_episodes))
 
 

@@ -18,14 +18,14 @@ import numpy as np
 import studio
 from cheetah_search import Effort, Judge, Simulator, search
 
-from jaxil import platform
+from jaxil.machine import startup
 
 TASK = "cheetah_run"
 EFFORT = Effort()
 
 
 def record(folder: pathlib.Path, num_episodes: int, *, effort: Effort = EFFORT) -> Any:
-    """Plays episodes and returns them as `jaxil.host.states.StateDemonstrations`.
+    """Plays episodes and returns them as `StateDemonstrations`.
 
     Each episode's draws depend on its number alone. Progress goes to stderr.
 
@@ -83,9 +83,9 @@ def load_judge(folder: pathlib.Path) -> tuple[Judge, Any, str]:
     import jax
     import jax.numpy as jnp
 
-    from jaxil import experiment, trained, workdir
     from jaxil.command import UsageError
     from jaxil.networks.agent import apply
+    from jaxil.training import assembly, trained, workdir
 
     config = workdir.read_config(folder)
     for field, wanted in (("task", TASK), ("observation", "state")):
@@ -97,7 +97,7 @@ def load_judge(folder: pathlib.Path) -> tuple[Judge, Any, str]:
     run = trained.load(folder)
     encoder, actor, critic = run.params
     action_dim = run.environment.action_spec().shape[0]
-    networks = experiment.make_networks(config, action_dim, mean=0.5)
+    networks = assembly.make_networks(config, action_dim, mean=0.5)
     run.environment.close()
 
     @jax.jit
@@ -124,7 +124,7 @@ def main(argv: list[str]) -> None:
         help="folder of a run of configs/expert.py:cheetah_run",
     )
     values = parser.parse_args(argv)
-    print(platform.prepare(), file=sys.stderr, flush=True)
+    print(startup.prepare(), file=sys.stderr, flush=True)
     from jaxil.command import UsageError
 
     try:

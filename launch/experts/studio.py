@@ -19,9 +19,9 @@ Decide = Callable[[int], np.ndarray]  # number of the decision -> action [A]
 
 def make_environment(task: str) -> Any:
     """Returns the environment that plays and is recorded."""
-    from jaxil.host import environment as environments
+    from jaxil.environments import suite
 
-    return environments.make_environment(
+    return suite.make_environment(
         task, seed=SEED, action_repeat=ACTION_REPEAT, observation="state"
     )
 
@@ -72,14 +72,14 @@ def play(environment: Any, begin: Callable[[int], Decide], num_episodes: int) ->
 
 
 def demonstrations(task: str, arrays: Any, expert: str) -> Any:
-    """Returns `jaxil.host.states.StateDemonstrations` of what `play` returned.
+    """Returns `StateDemonstrations` of what `play` returned.
 
     Args:
       task: `domain_task`.
       arrays: of `play`.
       expert: how the episodes were made.
     """
-    from jaxil.host import states
+    from jaxil.demonstrations import states
 
     metadata = states.new_metadata(
         task=task,
@@ -120,7 +120,7 @@ def write(parser: Parser, output: pathlib.Path, record: Callable[[], Any]) -> No
       output: the file.
       record: returns the demonstrations.
     """
-    from jaxil.host import states
+    from jaxil.demonstrations import states
 
     try:
         recorded = record()

@@ -11,8 +11,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from jaxil import platform
 from jaxil.config import unknown_name
+from jaxil.machine import startup
 from launch.sweeps import plan, slurm, state
 from launch.sweeps.process import Process
 from launch.sweeps.worker import Place, Worker
@@ -82,7 +82,7 @@ def uses_gpus(cluster: Cluster) -> bool:
     """Returns whether runs will compute on GPUs, told without starting jax."""
     if cluster.name == "slurm":
         return cluster.num_gpus > 0
-    return not platform.uses_cpu()
+    return not startup.uses_cpu()
 
 
 def num_at_once(cluster: Cluster, num_runs: int) -> int:
@@ -190,7 +190,7 @@ def _wait(jobs: Sequence[Any], watch: Callable[[], None]) -> None:
 
 def _gpus() -> list[str]:
     """Returns the NVIDIA devices that jax may use, as CUDA names them."""
-    if platform.uses_cpu() or not platform.has_cuda_device():
+    if startup.uses_cpu() or not startup.has_cuda_device():
         return []
     chosen = os.environ.get("CUDA_VISIBLE_DEVICES")
     if chosen is not None:

@@ -4,7 +4,7 @@ import statistics
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from jaxil.host.progress import duration
+from jaxil.machine.progress import duration
 from launch.sweeps.plan import Run
 from launch.sweeps.state import Status
 

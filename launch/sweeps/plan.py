@@ -7,8 +7,10 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-from jaxil import command, figures, workdir
+from jaxil import command
 from jaxil.config import Config, default_config, unknown_name
+from jaxil.reporting import figures
+from jaxil.training import workdir
 from launch.sweeps.faults import Faults, Faulty
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
@@ -80,7 +82,7 @@ def make_runs(
 
     Args:
       request: what to run.
-      config_problems: as `jaxil.experiment.problems`.
+      config_problems: as `jaxil.training.assembly.problems`.
 
     Raises:
       Faulty: names every fault of every run, each once.

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from jaxil.host.progress import duration
+from jaxil.machine.progress import duration
 from launch.sweeps import state
 from launch.sweeps.plan import Run
 from launch.sweeps.state import State, Status

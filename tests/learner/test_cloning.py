@@ -8,10 +8,10 @@ from scipy import stats
 
 from jaxil.learner.cloning import make_cloning_step
 from jaxil.learner.policy import make_exploit
+from jaxil.learner.rewarder import Spec
 from jaxil.learner.update import Learner, init_train_state
 from jaxil.maths import losses
 from jaxil.maths.types import ExpertBatch
-from jaxil.rewarders.rewarder import Spec
 from jaxil.rewarders.task import make_zero_rewarder
 from tests.tiny_agent import make_tiny_networks
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from jaxil.learner.rewarder import Spec
 from jaxil.learner.state import (
     LearnerParams,
     apply_gradients,
@@ -13,7 +14,6 @@ from jaxil.learner.state import (
 )
 from jaxil.learner.update import Learner, init_train_state, make_update_step
 from jaxil.maths.types import Batch
-from jaxil.rewarders.rewarder import Spec
 from jaxil.rewarders.task import make_task_rewarder
 from tests.tiny_agent import make_tiny_networks
 

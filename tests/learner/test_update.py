@@ -10,14 +10,14 @@ import numpy as np
 import optax
 import pytest
 
-from jaxil import native
+from jaxil.learner.rewarder import Rewarder, Spec
 from jaxil.learner.update import Learner, init_train_state, make_update_step
 from jaxil.maths.types import Batch, Episode, ExpertBatch, ExpertEpisodes, Window
+from jaxil.native import build
 from jaxil.networks.agent import apply, critic_features
-from jaxil.rewarders.adversarial import make_adversarial_rewarder
 from jaxil.rewarders.matching import make_matching
-from jaxil.rewarders.rewarder import Rewarder, Spec
-from jaxil.rewarders.sinkhorn import make_sinkhorn_rewarder
+from jaxil.rewarders.pdac import make_adversarial_rewarder
+from jaxil.rewarders.psil import make_sinkhorn_rewarder
 from jaxil.rewarders.task import make_task_rewarder
 from tests.tiny_agent import make_tiny_networks
 
@@ -532,7 +532,7 @@ def test_rejects_a_column_of_rewards():
 def test_native_convolutions_learn_the_same_over_50_updates():
     # Sums are taken in another order, so rounding differs, and Adam magnifies what
     # differs in small gradients; 50 updates of 3e-3 keep it below 1e-4.
-    assert native.problem() is None
+    assert build.problem() is None
     encoder = NETWORKS.encoder.clone(channels=(32, 32))
     networks = [
         NETWORKS._replace(encoder=encoder.clone(native=own)) for own in (False, True)

@@ -12,7 +12,7 @@ import pytest
 from absl.testing import parameterized
 from jax import lax
 
-from jaxil import native
+from jaxil.native import build
 from jaxil.networks.agent import apply
 from jaxil.networks.encoder import PixelEncoder, StateEncoder
 from jaxil.networks.layers import Trunk
@@ -170,7 +170,7 @@ def test_bfloat16_computes_in_halves_and_keeps_float32():
 class NativeTest(chex.TestCase):
     @with_and_without_jit
     def test_native_convolutions_change_neither_value_nor_gradients(self):
-        assert native.problem() is None
+        assert build.problem() is None
         plain = PixelEncoder((32, 64), (3, 3), (2, 1))
         images = random_images((5, 12, 12, 3))
         params = plain.init(jax.random.key(0), images)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxil import config as jaxil_config
-from jaxil.host import video
+from jaxil.files import video
 
 EVAL_HEADER = (
     "frame,seconds,episode,task_return_mean,task_return_std,expert_task_return_mean,"

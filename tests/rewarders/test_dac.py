@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxil.learner.rewarder import AgentView
 from jaxil.maths.types import Episode, ExpertBatch, Window
 from jaxil.rewarders.dac import make_dac_rewarder
-from jaxil.rewarders.rewarder import AgentView
 from tests.tiny_agent import NETWORKS, NOBODY, SIDE, make_spec
 
 STACK, BATCH = 2, 8

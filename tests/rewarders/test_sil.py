@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxil.learner.rewarder import AgentView
 from jaxil.maths.types import ExpertBatch, ExpertEpisodes
 from jaxil.rewarders.matching import make_matching
-from jaxil.rewarders.rewarder import AgentView
 from jaxil.rewarders.sil import batch_distance, make_sil_rewarder
 from tests.tiny_agent import NETWORKS, NOBODY, make_episode, make_spec, random_frames
 

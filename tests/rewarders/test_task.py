@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxil.learner.rewarder import AgentView, Spec
 from jaxil.learner.state import LearnerParams
 from jaxil.maths.types import Episode
-from jaxil.rewarders.rewarder import AgentView, Spec
 from jaxil.rewarders.task import make_task_rewarder, make_zero_rewarder
 
 NOTHING = LearnerParams({}, {}, {})

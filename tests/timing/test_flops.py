@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from jaxil import config as jaxil_config
-from jaxil import experiment
+from jaxil.learner.rewarder import Spec
 from jaxil.learner.update import Learner, init_train_state, make_update_step
 from jaxil.maths.types import Batch, ExpertBatch
-from jaxil.rewarders.rewarder import Spec
 from jaxil.timing import arithmetic, flops
 from jaxil.timing.parts import make_parts
+from jaxil.training import assembly
 
 # Two inputs, one feature, two hidden units, one action: small enough to count.
 _TINY = flops.Sizes(
@@ -98,8 +98,8 @@ def _parts_of(config):
     action, ones = jnp.zeros((size, 1)), jnp.ones(size)
     batch = Batch(pixels(size), action, ones, ones, pixels(size))
     expert = ExpertBatch(pixels(experts), jnp.zeros((experts, 1)))
-    networks = experiment.make_networks(config, 1, 0.5)
-    rewarder = experiment.make_rewarder(config, networks)
+    networks = assembly.make_networks(config, 1, 0.5)
+    rewarder = assembly.make_rewarder(config, networks)
     settings = {
         "learning_rate": 1e-4,
         "critic_target_tau": 0.01,

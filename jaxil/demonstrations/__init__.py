@@ -1,0 +1,1 @@
+"""Demonstrations: reading, rendering, checking and inspecting them."""

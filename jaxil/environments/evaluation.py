@@ -1,0 +1,77 @@
+"""How good a policy is by the task's own reward."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxil.environments.interaction import (
+    Act,
+    Decision,
+    FinishedEpisode,
+    interact,
+    join,
+)
+
+
+class Evaluation(NamedTuple):
+    """Episodes of one policy.
+
+    Attributes:
+      episodes: what was seen and done in each.
+      task_returns: undiscounted sums of the task's reward. Shape [E].
+      video: images of the first episode, uint8 [T + 1, H, W, 3]; None if not asked.
+    """
+
+    episodes: list[FinishedEpisode]
+    task_returns: np.ndarray
+    video: np.ndarray | None
+
+    @property
+    def mean(self) -> float:
+        """Mean return."""
+        return float(np.mean(self.task_returns))
+
+    @property
+    def std(self) -> float:
+        """Standard deviation of the returns over episodes."""
+        return float(np.std(self.task_returns))
+
+
+def evaluate(
+    environment: Any,
+    act: Act,
+    *,
+    num_episodes: int,
+    first_episode: int,
+    record_video: bool = False,
+) -> Evaluation:
+    """Plays whole episodes without learning.
+
+    Args:
+      environment: one that nothing else uses, with `frame()` for videos.
+      act: the policy; deterministic for the numbers that are reported.
+      num_episodes: how many, at least 1.
+      first_episode: number of the first, which fixes how each one starts.
+      record_video: whether to keep the first episode's images.
+    """
+    episodes: list[FinishedEpisode] = []
+    returns: list[float] = []
+    played: list[Decision] = []
+    images: list[np.ndarray] = []
+    if record_video:
+        # The reset's own image, before the first decision replaces it.
+        environment.reset(episode=first_episode)
+        images.append(environment.frame())
+    for decision in interact(environment, act, first_episode=first_episode):
+        played.append(decision)
+        if record_video and not episodes:
+            images.append(environment.frame())
+        if decision.is_last:
+            episodes.append(join(played))
+            # In double precision, as rewards come, whatever an episode stores.
+            returns.append(sum(each.task_reward for each in played))
+            played = []
+            if len(episodes) == num_episodes:
+                break
+    video = np.stack(images) if record_video else None
+    return Evaluation(episodes, np.asarray(returns), video)

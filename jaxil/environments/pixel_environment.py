@@ -1,0 +1,236 @@
+"""An agent's view of a suite task: in agent steps, as stacked images or as states."""
+
+import collections
+import math
+from typing import Any
+
+import dm_env
+import numpy as np
+from dm_env import specs
+
+from jaxil.environments.camera import Renderer
+
+_SEED_WORDS = 8
+# MuJoCo's stand-in for "no bound" on an actuator; no sensible range to rescale to.
+_UNBOUNDED = 1e9
+
+
+class PixelEnvironment(dm_env.Environment):
+    """A suite task seen through its camera.
+
+    Time runs in agent steps, each of `action_repeat` environment frames. The last
+    `frame_stack` images form one observation, uint8 [H, W, 3 * frame_stack], oldest
+    first; at a reset the first image stands for the missing ones. With
+    `observation="state"` it is the suite's own observation instead, flattened, of
+    one time only, float32 [S], and nothing is rendered unless asked for.
+    """
+
+    def __init__(
+        self,
+        suite_environment: Any,
+        *,
+        task: str,
+        seed: int,
+        action_repeat: int,
+        frame_stack: int,
+        observation: str,
+        renderer: Renderer,
+    ):
+        """Wraps `suite_environment`; see `make_environment` for the arguments."""
+        self._suite_environment = suite_environment
+        self._name = task
+        self._seed = seed
+        self._action_repeat = action_repeat
+        self._renders = observation == "pixels"
+        self._renderer = renderer
+        self._num_episodes_started = 0
+        self._reset_next_step = True
+        self._current: np.ndarray | None = None  # drawn or read at the present time
+        self._frames: collections.deque[np.ndarray] = collections.deque(
+            maxlen=frame_stack
+        )
+        bounds = suite_environment.action_spec()
+        bounded = np.abs(bounds.maximum) < _UNBOUNDED
+        self._action_low = np.where(bounded, bounds.minimum, -1.0)
+        self._action_half_range = (
+            np.where(bounded, bounds.maximum, 1.0) - self._action_low
+        ) / 2.0
+        self._action_spec = specs.BoundedArray(
+            shape=bounds.shape,
+            dtype=np.float32,
+            minimum=np.float32(-1.0),
+            maximum=np.float32(1.0),
+            name="action",
+        )
+        if self._renders:
+            size = renderer.image_size
+            self._observation_spec: specs.Array = specs.BoundedArray(
+                shape=(size, size, 3 * frame_stack),
+                dtype=np.uint8,
+                minimum=0,
+                maximum=255,
+                name="observation",
+            )
+        else:
+            parts = suite_environment.observation_spec().values()
+            state_dim = sum(math.prod(part.shape) for part in parts)
+            self._observation_spec = specs.Array(
+                shape=(state_dim,), dtype=np.float32, name="observation"
+            )
+
+    def reset(self, episode: int | None = None) -> dm_env.TimeStep:
+        """Starts an episode.
+
+        Args:
+          episode: number of the episode, from 0: together with the seed it fixes
+            the start, whatever was played before. None takes the number after the
+            last one played.
+        """
+        if episode is None:
+            episode = self._num_episodes_started
+        if episode < 0:
+            raise ValueError(f"episode={episode} must not be negative.")
+        words = np.random.SeedSequence([self._seed, episode]).generate_state(
+            _SEED_WORDS
+        )
+        self._suite_environment.task.random.seed(words)
+        self._suite_environment.reset()
+        self._num_episodes_started = episode + 1
+        self._reset_next_step = False
+        self._current = None
+        self._frames.clear()
+        return dm_env.restart(self._observe())
+
+    def step(self, action: np.ndarray) -> dm_env.TimeStep:
+        """Applies `action` for one agent step, or resets after an episode's end.
+
+        Args:
+          action: Shape [A], in [-1, 1].
+
+        Returns:
+          The time step: rewards of the repeats summed, discounts multiplied. The
+          discount stays 1 where a time limit ends the episode.
+
+        Raises:
+          ValueError: `action` has another shape.
+        """
+        if self._reset_next_step:
+            return self.reset()
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != self._action_spec.shape:
+            raise ValueError(
+                f"action has shape {action.shape}, expected {self._action_spec.shape}."
+            )
+        control = self._action_low + (action + 1.0) * self._action_half_range
+        reward, discount, is_last = 0.0, 1.0, False
+        for _ in range(self._action_repeat):
+            inner = self._suite_environment.step(control)
+            reward += float(inner.reward)
+            discount *= float(inner.discount)
+            is_last = inner.last()
+            if is_last:
+                break
+        self._reset_next_step = is_last
+        self._current = None
+        kind = dm_env.StepType.LAST if is_last else dm_env.StepType.MID
+        return dm_env.TimeStep(kind, reward, discount, self._observe())
+
+    def action_spec(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self,
+    ) -> specs.BoundedArray:
+        """Returns the spec of actions: float32 [A] in [-1, 1]."""
+        return self._action_spec
+
+    def observation_spec(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self,
+    ) -> specs.Array:
+        """Returns the spec of stacked pixels, or of the state vector."""
+        return self._observation_spec
+
+    def single_observation(self) -> np.ndarray:
+        """Returns the present alone: uint8 [H, W, 3], or float32 [S] in state mode.
+
+        It is what a replay stores for one time. After `set_simulator_state` it
+        shows the state that was set.
+        """
+        if self._current is None:
+            self._current = self._renderer.render() if self._renders else self._state()
+        return self._current.copy()
+
+    def frame(self) -> np.ndarray:
+        """Returns the present image, uint8 [H, W, 3]; in state mode it is drawn now."""
+        return self.single_observation() if self._renders else self._renderer.render()
+
+    def simulator_state(self) -> dict[str, np.ndarray]:
+        """Returns copies of `qpos`, `qvel` and `act`, each float64 and 1-D."""
+        data = self.physics.data
+        return {
+            name: np.array(getattr(data, name), dtype=np.float64)
+            for name in ("qpos", "qvel", "act")
+        }
+
+    def set_simulator_state(
+        self, qpos: np.ndarray, qvel: np.ndarray, act: np.ndarray
+    ) -> None:
+        """Puts the simulation into a state from `simulator_state`.
+
+        `frame` and `single_observation` show it at once; the stack keeps its images
+        until the next step. Touch and acceleration sensors, which depend on the
+        forces of the step before, are those of the state at rest from actuation.
+
+        Raises:
+          ValueError: an array has another shape than the model's.
+        """
+        data = self.physics.data
+        values = {"qpos": qpos, "qvel": qvel, "act": act}
+        for name, value in values.items():
+            shape = getattr(data, name).shape
+            if np.shape(value) != shape:
+                raise ValueError(
+                    f"{name} has shape {np.shape(value)}, but {self._name} "
+                    f"needs {shape}."
+                )
+        with self.physics.reset_context():
+            for name, value in values.items():
+                getattr(data, name)[:] = value
+        self._current = None
+
+    @property
+    def episode_steps(self) -> int | None:
+        """Agent steps of a whole episode; None where only the task ends it."""
+        limit = self._suite_environment._step_limit
+        return None if math.isinf(limit) else math.ceil(limit / self._action_repeat)
+
+    @property
+    def num_episodes_started(self) -> int:
+        """The number that `reset()` will give to the next episode."""
+        return self._num_episodes_started
+
+    @property
+    def physics(self) -> Any:
+        """The dm_control `Physics`."""
+        return self._suite_environment.physics
+
+    @property
+    def renderer(self) -> Renderer:
+        """What draws this environment's images."""
+        return self._renderer
+
+    def close(self) -> None:
+        """Frees the simulation and its GL context."""
+        self.physics.free()
+
+    def _state(self) -> np.ndarray:
+        values = self._suite_environment.task.get_observation(self.physics).values()
+        flat = [np.ravel(value) for value in values]
+        return np.concatenate(flat).astype(np.float32)
+
+    def _observe(self) -> np.ndarray:
+        single = self.single_observation()
+        if not self._renders:
+            return single
+        if not self._frames:
+            self._frames.extend([single] * (self._frames.maxlen or 1))
+        else:
+            self._frames.append(single)
+        return np.concatenate(self._frames, axis=2)

@@ -1,0 +1,1 @@
+"""File formats: archives, tables, videos."""

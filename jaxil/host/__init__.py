@@ -1,1 +1,0 @@
-"""Simulators, files and clocks: everything that touches the machine, in NumPy."""

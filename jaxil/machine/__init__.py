@@ -1,0 +1,1 @@
+"""The machine: start-up, caches, signals, progress."""

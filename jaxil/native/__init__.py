@@ -1,0 +1,1 @@
+"""The encoder in C: sources, build, and its jax function."""

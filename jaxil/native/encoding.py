@@ -1,0 +1,146 @@
+"""An encoder's convolutions in C: all layers of an image at once, for CPUs."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+# By two vectors of a processor it takes features; no CPU's vectors are longer.
+FEATURES = 32
+MOST_LAYERS = 8
+
+
+class Weights(NamedTuple):
+    """Of one layer.
+
+    Attributes:
+      kernel: float32 [h, w, C, F], F a multiple of FEATURES.
+      bias: float32 [F].
+    """
+
+    kernel: Array
+    bias: Array
+
+
+def encode(
+    pixels: Array,
+    mean: Array,
+    weights: Sequence[Weights],
+    *,
+    contrast: float,
+    strides: tuple[int, ...],
+) -> Array:
+    """Passes pixels through VALID convolutions with ReLU.
+
+        x_0 = contrast (pixels / 255 - mean)
+        x_l[i, j, f] = max(0, z[i, j, f])
+        z[i, j, f] = b[f] + sum_{u,v,c} x_{l-1}[s i + u, s j + v, c] k[u, v, c, f]
+
+    `jaxil.native.build` has to be loaded. It can be differentiated once, for the weights;
+    pixels and mean have no gradient. Kernels of 3x3 without stride take another way,
+    see `winograd.h`: it rounds otherwise, and what is not finite spreads by a pixel.
+
+    Args:
+      pixels: uint8 [B, H, W, C].
+      mean: float32 [H, W, C], or of one number, any rank.
+      weights: of each layer, at most MOST_LAYERS.
+      contrast: factor on the centred pixels.
+      strides: s of each layer, along both sides.
+
+    Returns:
+      The last layer's output, float32 [B, H', W', F].
+    """
+    chex.assert_rank(pixels, 4)
+    chex.assert_type([pixels, mean], [jnp.uint8, jnp.float32])
+    chex.assert_equal(len(weights), len(strides))
+    assert mean.size == 1 or mean.shape == pixels.shape[1:], mean.shape
+    assert 1 <= len(weights) <= MOST_LAYERS, len(weights)
+    channels = pixels.shape[3]
+    for kernel, bias in weights:
+        chex.assert_shape([kernel, bias], [(None, None, channels, None), (None,)])
+        chex.assert_equal(kernel.shape[3], bias.shape[0])
+        channels = kernel.shape[3]
+        assert channels % FEATURES == 0, channels
+    settings = _Settings(contrast, strides)
+    return _ENCODE(settings, pixels, mean, tuple(weights))
+
+
+class _Settings(NamedTuple):
+    contrast: float
+    strides: tuple[int, ...]
+
+
+class _Saved(NamedTuple):
+    """What the gradients need; an output tells where ReLU let pass."""
+
+    pixels: Array
+    mean: Array
+    weights: tuple[Weights, ...]
+    outputs: Sequence[Array]
+
+
+def _encode(
+    settings: _Settings, pixels: Array, mean: Array, weights: tuple[Weights, ...]
+) -> Array:
+    (y,) = _outputs(settings, pixels, mean, weights, wanted=1)
+    return y
+
+
+def _forward(
+    settings: _Settings, pixels: Array, mean: Array, weights: tuple[Weights, ...]
+) -> tuple[Array, _Saved]:
+    outputs = _outputs(settings, pixels, mean, weights, wanted=len(weights))
+    return outputs[-1], _Saved(pixels, mean, weights, outputs)
+
+
+def _backward(
+    settings: _Settings, saved: _Saved, cotangent: Array
+) -> tuple[None, None, tuple[Weights, ...]]:
+    shapes = [_array(*leaf.shape) for leaf in jax.tree.leaves(saved.weights)]
+    gradients = _call("jaxil_encode_gradient", shapes, settings, saved, cotangent)
+    of_layers = zip(gradients[::2], gradients[1::2], strict=True)
+    return None, None, tuple(Weights(*layer) for layer in of_layers)
+
+
+_ENCODE: Any = jax.custom_vjp(_encode, nondiff_argnums=(0,))
+_ENCODE.defvjp(_forward, _backward)
+
+
+def _outputs(
+    settings: _Settings,
+    pixels: Array,
+    mean: Array,
+    weights: tuple[Weights, ...],
+    *,
+    wanted: int,
+) -> Sequence[Array]:
+    """Returns the outputs of the last layers, as many as are wanted."""
+    size, shapes = pixels.shape[1:3], []
+    for (kernel, _), stride in zip(weights, settings.strides, strict=True):
+        assert all(n >= k for n, k in zip(size, kernel.shape)), (size, kernel.shape)
+        size = tuple((n - k) // stride + 1 for n, k in zip(size, kernel.shape))
+        shapes.append(_array(pixels.shape[0], *size, kernel.shape[3]))
+    return _call("jaxil_encode", shapes[-wanted:], settings, pixels, mean, weights)
+
+
+def _array(*shape: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(shape, jnp.float32)
+
+
+def _call(
+    name: str,
+    results: Sequence[jax.ShapeDtypeStruct],
+    settings: _Settings,
+    *arguments: Any,
+) -> Sequence[Array]:
+    """Calls a function of encoder.c with the leaves of the arguments in their order."""
+    call = jax.ffi.ffi_call(name, results, vmap_method="sequential")
+    return call(
+        *jax.tree.leaves(arguments),
+        contrast=np.float32(settings.contrast),
+        strides=np.asarray(settings.strides, np.int64),
+    )

@@ -1,0 +1,1 @@
+"""The replay: a ring of single frames, and sampling from it."""

@@ -1,0 +1,56 @@
+"""A copy of the replay's frames on the device, so that only indices travel there.
+
+The NumPy ring stays what is saved and what is read back; the copy follows it.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxil.replay.replay import Replay
+
+# One size for all writes, so that they compile once; 1.4 MB of the paper's frames.
+_BLOCK_FRAMES = 64
+
+
+class Mirror:
+    """Holds the frames of a replay's ring in one array on jax's default device.
+
+    Attributes:
+      frames: like `Replay.frames`, equal to it wherever an episode is stored. A
+        `refresh` replaces and deletes it: read it afresh for each use.
+    """
+
+    def __init__(self, replay: Replay, *, block_frames: int = _BLOCK_FRAMES) -> None:
+        """Reserves the device's memory and copies what is stored already.
+
+        Args:
+          replay: not to be cleared from now on.
+          block_frames: frames that are sent in one go, >= 1.
+        """
+        self._replay = replay
+        self._block_frames = min(block_frames, len(replay.frames))
+        self._num_episodes = 0
+        self.frames = jnp.zeros(replay.frames.shape, replay.frames.dtype)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Copies the episodes that were added since the last time."""
+        ring, size = self._replay.frames, self._block_frames
+        added = self._replay.num_episodes_added
+        for index in range(max(self._replay.oldest_episode, self._num_episodes), added):
+            # Whole blocks of the ring: their other frames are sent as they were.
+            for block in np.unique(self._replay.slots(index) // size):
+                first = min(block * size, len(ring) - size)
+                # A copy, because jax may go on reading after the ring has changed.
+                frames = np.array(ring[first : first + size])
+                self.frames = _write(self.frames, frames, np.int32(first))
+        self._num_episodes = added
+
+
+# The array is donated: it is written to in place, not copied whole.
+@functools.partial(jax.jit, donate_argnums=0)
+def _write(frames: jax.Array, block: jax.Array, first: jax.Array) -> jax.Array:
+    return jax.lax.dynamic_update_slice_in_dim(frames, block, first, axis=0)

@@ -1,0 +1,270 @@
+"""A ring of NumPy arrays that keeps the newest whole episodes.
+
+Each frame is stored once. Whole episodes enter, and the oldest whole episodes leave.
+
+Axes: T steps of an episode, H W C pixels.
+"""
+
+import collections
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxil.replay.episode import Episode, checked_episode, checked_values, require
+
+
+class _Stored(NamedTuple):
+    start: int  # slot of the episode's first frame
+    num_steps: int
+
+
+class EpisodeRing:
+    """Stores the newest episodes.
+
+    The next free slot follows the newest frame, modulo the ring's length; an episode
+    may run over the ring's end. A slot holds o_t with the a_t, r_t and d_t that follow.
+    """
+
+    def __init__(
+        self,
+        *,
+        capacity_steps: int,
+        episode_steps: int,
+        observation_shape: tuple[int, ...],
+        observation_dtype,
+        action_dim: int,
+    ):
+        """Reserves the memory; the system hands it out as it is written to.
+
+        Args:
+          capacity_steps: transitions kept at most, >= episode_steps.
+          episode_steps: transitions of a usual episode (see `ring_slots`), >= 1.
+          observation_shape: shape of a single frame, (H, W, C), or of a state, (S,).
+          observation_dtype: uint8 for pixels, float32 for states.
+          action_dim: A >= 1.
+
+        Raises:
+          ValueError: if a number breaks its rule.
+        """
+        shape = tuple(observation_shape)
+        require(episode_steps >= 1, "episode_steps", episode_steps, ">= 1")
+        require(len(shape) in (1, 3), "observation_shape", shape, "(H, W, C) or (S,)")
+        require(action_dim >= 1, "action_dim", action_dim, ">= 1")
+        enough = f"room for an episode, {episode_steps} steps"
+        require(
+            capacity_steps >= episode_steps, "capacity_steps", capacity_steps, enough
+        )
+        self._capacity_steps = capacity_steps
+        slots = ring_slots(capacity_steps, episode_steps)
+        # np.empty and np.zeros touch no page yet: memory use grows with the run.
+        self._frames = np.empty((slots, *shape), observation_dtype)
+        self._actions = np.zeros((slots, action_dim), np.float32)
+        self._rewards = np.zeros(slots, np.float32)
+        self._discounts = np.zeros(slots, np.float32)
+        self.clear()
+
+    def clear(self, first_episode: int = 0) -> None:
+        """Forgets all episodes; the next one added gets the number `first_episode`."""
+        self._stored: collections.deque[_Stored] = collections.deque()
+        self._num_episodes_added = first_episode
+        self._num_steps_stored = 0
+        self._num_frames_stored = 0
+        self._next_slot = 0
+        self._index_episodes()
+
+    @property
+    def frames(self) -> np.ndarray:
+        """The ring of frames itself, read-only: [num_slots, H, W, C] or [.., S]."""
+        ring = self._frames.view()
+        ring.flags.writeable = False
+        return ring
+
+    @property
+    def num_steps_stored(self) -> int:
+        """Transitions in the replay now."""
+        return self._num_steps_stored
+
+    @property
+    def num_episodes_stored(self) -> int:
+        """Episodes in the replay now."""
+        return len(self._stored)
+
+    @property
+    def num_episodes_added(self) -> int:
+        """Episodes ever added; the newest one has the number below this."""
+        return self._num_episodes_added
+
+    @property
+    def oldest_episode(self) -> int:
+        """Number of the oldest episode that is still stored."""
+        return self._num_episodes_added - len(self._stored)
+
+    def add_episode(self, *, frames, actions, rewards, discounts) -> None:
+        """Copies one whole episode in; the oldest ones make room for it.
+
+        Args:
+          frames: [T + 1, H, W, C] uint8, or [T + 1, S] float32: o_0 ... o_T, unstacked.
+          actions: [T, A] float, finite: actions[t] was taken on seeing o_t.
+          rewards: [T] float, finite: rewards[t] came with o_{t+1}.
+          discounts: [T] float in [0, 1]: 0 after a true end, 1 at a time limit.
+
+        Raises:
+          ValueError: for a wrong shape or dtype, a number that is not finite, or an
+            episode that is longer than the replay; nothing is changed then.
+        """
+        like = Episode(self._frames, self._actions, self._rewards, self._discounts)
+        frames, actions, rewards, discounts = checked_episode(
+            frames, actions, rewards, discounts, like=like
+        )
+        num_steps = len(rewards)
+        length = len(self._frames)
+        fits = num_steps <= self._capacity_steps and num_steps < length
+        require(
+            fits, "episode length", num_steps, f"at most {self._capacity_steps} steps"
+        )
+
+        while (
+            self._num_steps_stored + num_steps > self._capacity_steps
+            or self._num_frames_stored + num_steps + 1 > length
+        ):
+            evicted = self._stored.popleft()
+            self._num_steps_stored -= evicted.num_steps
+            self._num_frames_stored -= evicted.num_steps + 1
+        start = self._next_slot
+        # In two pieces where the ring ends: slices copy faster than index lists.
+        head = min(num_steps + 1, length - start)
+        self._frames[start : start + head] = frames[:head]
+        self._frames[: num_steps + 1 - head] = frames[head:]
+        slots = (start + np.arange(num_steps)) % length
+        self._actions[slots] = actions
+        self._rewards[slots] = rewards
+        self._discounts[slots] = discounts
+        self._stored.append(_Stored(start, num_steps))
+        self._next_slot = (start + num_steps + 1) % length
+        self._num_steps_stored += num_steps
+        self._num_frames_stored += num_steps + 1
+        self._num_episodes_added += 1
+        self._index_episodes()
+
+    def replace_rewards(self, index: int, rewards) -> None:
+        """Gives one stored episode other rewards.
+
+        Args:
+          index: see `episode`.
+          rewards: [T] float, finite, for the T steps that the episode has.
+
+        Raises:
+          IndexError: if it is not stored.
+          ValueError: for a wrong shape or dtype, or a number that is not finite;
+            nothing is changed then.
+        """
+        slots = self.slots(index)[:-1]
+        self._rewards[slots] = checked_values("rewards", rewards, self._rewards[slots])
+
+    def rewards(self, index: int) -> np.ndarray:
+        """Copies the rewards of one stored episode out, [T].
+
+        Args:
+          index: see `episode`.
+
+        Raises:
+          IndexError: if it is not stored.
+        """
+        return self._rewards[self.slots(index)[:-1]]
+
+    def actions(self, index: int) -> np.ndarray:
+        """Copies the actions of one stored episode out, [T, A].
+
+        Args:
+          index: see `episode`.
+
+        Raises:
+          IndexError: if it is not stored.
+        """
+        return self._actions[self.slots(index)[:-1]]
+
+    def mean_reward(self) -> float:
+        """Returns the mean of all stored rewards; NaN without any."""
+        total = sum(
+            self.rewards(index).sum(dtype=np.float64)
+            for index in range(self.oldest_episode, self.num_episodes_added)
+        )
+        return float(total / self._num_steps_stored) if self._stored else math.nan
+
+    def episode(self, index: int) -> Episode:
+        """Copies one stored episode out.
+
+        Args:
+          index: its number, `oldest_episode` <= index < `num_episodes_added`.
+
+        Raises:
+          IndexError: if it is not stored.
+        """
+        slots = self.slots(index)
+        return Episode(
+            frames=self._frames[slots],
+            actions=self._actions[slots[:-1]],
+            rewards=self._rewards[slots[:-1]],
+            discounts=self._discounts[slots[:-1]],
+        )
+
+    def slots(self, index: int) -> np.ndarray:
+        """Returns where the frames of a stored episode lie in `frames`, [T + 1].
+
+        Args:
+          index: see `episode`.
+
+        Raises:
+          IndexError: if it is not stored.
+        """
+        if not self.oldest_episode <= index < self._num_episodes_added:
+            raise IndexError(
+                f"episode {index} is not stored: the replay holds"
+                f" {self.oldest_episode} to {self._num_episodes_added - 1}"
+            )
+        start, num_steps = self._stored[index - self.oldest_episode]
+        return (start + np.arange(num_steps + 1)) % len(self._frames)
+
+    def check_valid(self) -> tuple[bool, str]:
+        """Checks that the books agree with one another.
+
+        Returns:
+          (True, "") or (False, what is wrong).
+        """
+        length = len(self._frames)
+        steps = sum(stored.num_steps for stored in self._stored)
+        frames = steps + len(self._stored)
+        if steps != self._num_steps_stored or steps > self._capacity_steps:
+            return False, (
+                f"{steps} steps stored, counted {self._num_steps_stored},"
+                f" capacity {self._capacity_steps}"
+            )
+        if frames != self._num_frames_stored or frames > length:
+            return False, (
+                f"{frames} frames stored, counted {self._num_frames_stored},"
+                f" {length} slots"
+            )
+        if self.oldest_episode < 0:
+            return False, f"oldest episode is number {self.oldest_episode}"
+        expected = (self._next_slot - frames) % length
+        for number, stored in enumerate(self._stored, start=self.oldest_episode):
+            if stored.num_steps < 1:
+                return False, f"episode {number} has {stored.num_steps} steps"
+            if stored.start != expected:
+                return False, (
+                    f"episode {number} starts in slot {stored.start}:"
+                    f" expected {expected}"
+                )
+            expected = (expected + stored.num_steps + 1) % length
+        return True, ""
+
+    def _index_episodes(self) -> None:
+        """Lays the books out as arrays, which a draw can look up."""
+        table = np.array(self._stored, np.int64).reshape(-1, 2)
+        self._starts, self._lengths = table.T  # first slot and steps of each episode
+
+
+def ring_slots(capacity_steps: int, episode_steps: int) -> int:
+    """Returns the frames that a ring has room for: one more than steps per episode."""
+    return capacity_steps + math.ceil(capacity_steps / episode_steps)

@@ -1,0 +1,1 @@
+"""A training run: its assembly, its files, its checkpoints."""

@@ -1,0 +1,378 @@
+"""Foreign files as the agent gets them: size, frame skip, lengths, and what is said."""
+
+import json
+import logging
+import zipfile
+
+import numpy as np
+import pytest
+
+from jaxil.demonstrations import foreign, loading
+from jaxil.demonstrations.readers import own
+from jaxil.demonstrations.readers.recording import FormatError, PixelEpisode, Recording
+from jaxil.demonstrations.readers.validation import check_episode
+from jaxil.demonstrations.states import DemonstrationError
+from jaxil.files import archive
+from tests.demonstrations import foreign_files, test_readers_fuzz
+
+TASK = "cartpole_swingup"  # 100 control steps in a second
+LIMIT = 2**30
+
+
+def make_episode(num_steps=6, size=8, seed=0, action_dim=1):
+    rng = np.random.default_rng(seed)
+    return PixelEpisode(
+        rng.integers(0, 256, (num_steps + 1, size, size, 3), dtype=np.uint8),
+        rng.uniform(-1, 1, (num_steps, action_dim)).astype(np.float32),
+        rng.uniform(0, 1, num_steps).astype(np.float32),
+    )
+
+
+def known(array: np.ndarray | None) -> np.ndarray:
+    assert array is not None
+    return array
+
+
+def make_recording(episodes, **facts):
+    return Recording("made up", len(episodes), iter(episodes), **facts)
+
+
+def write(path, episodes, **facts):
+    own.write_pixels(path, make_recording(episodes, **facts), origin="a test")
+    return path
+
+
+def load(path, **changes):
+    settings = {
+        "task": TASK,
+        "num_episodes": 2,
+        "action_repeat": 2,
+        "image_size": 8,
+        "render_quality": "fast",
+    }
+    return loading.load(path, **(settings | changes))
+
+
+@pytest.fixture(name="path")
+def _path(tmp_path):
+    return tmp_path / "pixels.npz"
+
+
+# --- our own file ---------------------------------------------------------------------
+
+
+def test_what_is_written_is_read(path):
+    episodes = [make_episode(4), make_episode(6, seed=1)._replace(rewards=None)]
+    write(path, episodes, task=TASK, action_repeat=2, frames_per_second=50.0)
+    recording = foreign.open_recording(path, max_bytes=LIMIT)
+    assert recording.kind == "jaxil pixels"
+    assert (recording.task, recording.action_repeat) == (TASK, 2)
+    assert recording.frames_per_second == 50.0
+    assert "a test" in recording.notes[0]
+    read = list(recording.episodes)
+    assert len(read) == recording.num_episodes == 2
+    for one, other in zip(read, episodes, strict=True):
+        for got, expected in zip(one, other, strict=True):
+            assert (got is None) == (expected is None)
+            if expected is not None:
+                np.testing.assert_array_equal(got, expected)
+
+
+def test_a_broken_recording_leaves_the_old_file(path):
+    write(path, [make_episode()])
+    before = path.read_bytes()
+
+    def episodes():
+        yield make_episode()
+        raise FormatError("is cut off")
+
+    with pytest.raises(FormatError):
+        own.write_pixels(path, Recording("x", 2, episodes()), origin="x")
+    assert path.read_bytes() == before
+    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
+
+
+def set_metadata(path, **changes):
+    with zipfile.ZipFile(path) as whole:
+        members = {name: whole.read(name) for name in whole.namelist()}
+    arrays = archive.read_archive(path, max_bytes={"metadata": 10**6})
+    metadata = {**json.loads(str(arrays["metadata"])), **changes}
+    with zipfile.ZipFile(path, "w") as changed:
+        for name, content in members.items():
+            if name != "metadata.npy":
+                changed.writestr(name, content)
+        with changed.open("metadata.npy", "w") as member:
+            np.lib.format.write_array(member, np.array(json.dumps(metadata)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format": "x"}, "lack the format's name"),
+        ({"version": 2}, "version 2 of the format"),
+        ({"num_episodes": 0, "has_actions": [], "has_rewards": []}, "num_episodes=0"),
+        ({"num_episodes": "2"}, "num_episodes='2'"),
+        ({"has_actions": [True]}, "do not fit"),
+        ({"num_episodes": 3, "has_actions": [0] * 3, "has_rewards": [0] * 3}, "no arr"),
+        ({"action_repeat": "2"}, "action_repeat='2', where int"),
+        ({"frames_per_second": 0.0}, "frames_per_second=0.0"),
+        ({"task": 1}, "task=1, where str"),
+        ({"origin": None}, "without origin"),
+    ],
+)
+def test_metadata_that_break_the_rules(path, changes, message):
+    write(path, [make_episode(), make_episode(seed=1)])
+    set_metadata(path, **changes)
+    with pytest.raises(FormatError, match=message):
+        list(foreign.open_recording(path, max_bytes=LIMIT).episodes)
+
+
+def test_an_array_above_the_limit_is_not_unpacked(path):
+    write(path, [make_episode()])
+    with pytest.raises(FormatError, match="frames_0 of 1472 bytes, more than the 1000"):
+        list(foreign.open_recording(path, max_bytes=1000).episodes)
+
+
+# --- the rules of an episode ----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda e: e._replace(frames=e.frames[..., :1]), "uint8"),
+        (lambda e: e._replace(frames=e.frames.astype(np.float32)), "float32"),
+        (lambda e: e._replace(frames=e.frames[:1]), "1 frames"),
+        (lambda e: e._replace(frames=e.frames[:, :0]), "8x0 pixels"),
+        (lambda e: e._replace(actions=e.actions[:-1]), "actions of shape"),
+        (lambda e: e._replace(actions=e.actions[:, 0]), "actions of shape"),
+        (lambda e: e._replace(rewards=e.rewards[:, None]), "rewards of shape"),
+        (lambda e: e._replace(rewards=e.rewards * np.float32("nan")), "not finite"),
+        (lambda e: e._replace(actions=e.actions.astype(float)), "not finite float32"),
+    ],
+)
+def test_episodes_that_break_the_rules_are_refused(change, message):
+    check_episode(3, make_episode())
+    with pytest.raises(FormatError, match=message) as caught:
+        check_episode(3, change(make_episode()))
+    assert "episode 3" in str(caught.value)
+
+
+# --- what the agent gets --------------------------------------------------------------
+
+
+def test_frames_are_resized_without_skipping_pixels():
+    # Stripes one pixel wide are grey when seen from afar; a reader that took every
+    # fourth pixel would see only one colour.
+    stripes = np.zeros((2, 32, 32, 3), np.uint8)
+    stripes[:, :, ::2] = 255
+    small = foreign.resized(stripes, 8)
+    assert small.shape == (2, 8, 8, 3)
+    assert abs(small[:, 1:-1, 1:-1].astype(float).mean() - 127.5) < 4
+    assert small[:, 1:-1, 1:-1].std() < 4
+    assert foreign.resized(stripes, 32) is stripes
+    flat = np.full((1, 6, 10, 3), 99, np.uint8)
+    np.testing.assert_array_equal(foreign.resized(flat, 8), np.full((1, 8, 8, 3), 99))
+
+
+def test_frame_skip_keeps_every_nth_frame_and_all_rewards(path):
+    episodes = [make_episode(6), make_episode(5, seed=1)]
+    write(path, episodes, frames_per_second=100.0, action_repeat=1)
+    loaded = load(path, frame_skip=2)
+    assert loaded.metadata["frames_per_second"] == 50.0
+    assert loaded.metadata["action_repeat"] == 2
+    np.testing.assert_array_equal(loaded.num_frames, [4, 3])
+    np.testing.assert_array_equal(loaded.frames[0], episodes[0].frames[::2])
+    np.testing.assert_array_equal(loaded.frames[1, :3], episodes[1].frames[:5:2])
+    np.testing.assert_array_equal(loaded.frames[1, 3], episodes[1].frames[4])
+    actions = [known(episode.actions) for episode in episodes]
+    np.testing.assert_array_equal(known(loaded.actions)[0], actions[0][::2])
+    np.testing.assert_array_equal(known(loaded.actions)[1, :2], actions[1][:4:2])
+    rewards = [known(episode.rewards) for episode in episodes]
+    np.testing.assert_allclose(
+        loaded.metadata["returns"],
+        [rewards[0].sum(), rewards[1][:4].sum()],
+        rtol=1e-6,
+    )
+    with pytest.raises(DemonstrationError, match="too few for frame_skip=6"):
+        load(path, frame_skip=6)
+
+
+def test_the_first_episodes_are_taken_and_unlike_lengths_filled_up(path):
+    episodes = [make_episode(n, seed=n) for n in (3, 6, 4)]
+    write(path, episodes)
+    loaded = load(path, num_episodes=3)
+    np.testing.assert_array_equal(loaded.num_frames, [4, 7, 5])
+    assert loaded.frames.shape == (3, 7, 8, 8, 3)
+    for row, episode in zip(loaded.frames, episodes, strict=True):
+        length = len(episode.frames)
+        np.testing.assert_array_equal(row[:length], episode.frames)
+        assert (row[length:] == episode.frames[-1]).all()
+    one = load(path, num_episodes=1)
+    np.testing.assert_array_equal(one.frames, episodes[0].frames[None])
+
+
+def test_samples_come_from_every_own_frame_and_no_filling(path):
+    # The value of a frame is its episode and time; fillings would repeat the last one.
+    episodes = []
+    for index, num_steps in enumerate((2, 5)):
+        times = np.arange(num_steps + 1, dtype=np.uint8) + 10 * index
+        frames = np.broadcast_to(times[:, None, None, None], (num_steps + 1, 8, 8, 3))
+        actions = times[:-1, None].astype(np.float32)
+        episodes.append(PixelEpisode(frames.copy(), actions))
+    write(path, episodes)
+    loaded = load(path)
+    observations, actions = loading.sample(
+        loaded, np.random.default_rng(0), 500, frame_stack=2
+    )
+    newest = observations[:, 0, 0, -1]
+    assert set(newest.tolist()) == {0, 1, 10, 11, 12, 13, 14}
+    np.testing.assert_array_equal(newest, actions[:, 0])
+    before = np.where(newest % 10 == 0, newest, newest - 1)
+    np.testing.assert_array_equal(observations[:, 0, 0, 0], before)
+    counts = np.unique(newest, return_counts=True)[1]
+    assert counts.min() > 500 / 7 * 0.6, "each transition is as likely as another"
+
+
+def test_what_only_some_episodes_have_is_left_out(path):
+    episodes = [make_episode(), make_episode()._replace(actions=None, rewards=None)]
+    loaded = load(write(path, episodes))
+    assert loaded.actions is None
+    assert loaded.task_rewards is None
+    assert loaded.mean_return() is None
+    drawn, actions = loading.sample(loaded, np.random.default_rng(0), 4, frame_stack=1)
+    assert drawn.shape == (4, 8, 8, 3)
+    assert actions.shape == (4, 0)
+
+
+# --- what is said ---------------------------------------------------------------------
+
+
+def test_a_file_that_matches_is_warned_of_once(path, caplog):
+    write(path, [make_episode(), make_episode()], frames_per_second=50.0)
+    with caplog.at_level(logging.WARNING):
+        load(path)
+    assert "renderer" in caplog.text
+    assert "resized" not in caplog.text
+    assert "frames per second" not in caplog.text
+    assert "action_repeat" not in caplog.text
+
+
+def test_what_cannot_match_is_said(path, caplog):
+    episode = make_episode()._replace(frames=np.zeros((7, 6, 12, 3), np.uint8))
+    write(path, [episode, episode], action_repeat=4, frames_per_second=25.0)
+    with caplog.at_level(logging.WARNING):
+        load(path)
+    assert "12x6 pixels are resized to 8x8, squeezed" in caplog.text
+    assert "action_repeat=4, and the run has 2" in caplog.text
+    assert "25 frames per second, and the agent decides 50 times" in caplog.text
+    assert "Made from: a test" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"num_episodes": 3}, "holds 2 episodes, and num_episodes=3"),
+        ({"num_episodes": 0}, "num_episodes=0"),
+        ({"task": "walker_walk"}, f"shows {TASK}, but the task is walker_walk"),
+        ({"observation": "state"}, "holds pixels"),
+        ({"image_size": 9, "max_bytes": 3000}, "needs more than 3000 bytes"),
+        ({"max_bytes": 1000}, "more than the 1000"),
+    ],
+)
+def test_a_file_that_cannot_serve(path, changes, message):
+    write(path, [make_episode(), make_episode()], task=TASK)
+    settings = {"task": TASK, "num_episodes": 2, "action_repeat": 2, "image_size": 8}
+    for call in (load, lambda *a, **k: loading.check(*a, **(settings | k))):
+        with pytest.raises(DemonstrationError, match=message) as caught:
+            call(path, **changes)
+        assert str(path) in str(caught.value)
+
+
+def test_actions_are_needed_only_where_they_are_seen(path):
+    settings = {"task": TASK, "num_episodes": 1, "action_repeat": 2, "image_size": 8}
+    write(path, [make_episode(action_dim=3)])
+    loading.check(path, **settings)
+    with pytest.raises(DemonstrationError, match=r"actions of 3 numbers.*needs 1"):
+        loading.check(path, sees_actions=True, **settings)
+    write(path, [make_episode()._replace(actions=None)])
+    with pytest.raises(DemonstrationError, match="holds no actions"):
+        loading.check(path, sees_actions=True, **settings)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"hello", b"PK\x03\x04", "folder"])
+def test_what_no_reader_knows_is_refused(path, content):
+    if content == "folder":
+        path.mkdir()
+        (path / "notes.txt").write_text("nothing")
+    elif content is not None:
+        path.write_bytes(content)
+    message = "cannot be read" if content is None else "cut off, damaged, or in no form"
+    with pytest.raises(DemonstrationError, match=message) as caught:
+        load(path)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_a_file_is_read_once_until_it_changes(path, monkeypatch):
+    write(path, [make_episode(), make_episode()])
+    calls = []
+    read = foreign.read_episodes
+
+    def counted(*args, **kwargs):
+        calls.append(args)
+        return read(*args, **kwargs)
+
+    monkeypatch.setattr(foreign, "read_episodes", counted)
+    settings = {"task": TASK, "num_episodes": 2, "action_repeat": 2, "image_size": 8}
+    loading.check(path, **settings)
+    first = load(path)
+    assert len(calls) == 1
+    write(path, [make_episode(seed=5), make_episode(seed=6)])
+    assert not np.array_equal(load(path).frames, first.frames)
+    assert len(calls) == 2
+
+
+# --- all formats ----------------------------------------------------------------------
+
+
+WRITERS = {
+    name.removeprefix("write_"): getattr(foreign_files, name)
+    for name in dir(foreign_files)
+    if name.startswith("write_")
+}
+
+
+@pytest.mark.parametrize("name", sorted(WRITERS))
+def test_each_format_gives_the_same_demonstrations_after_conversion(
+    name, tmp_path, path
+):
+    if name == "minari":
+        pytest.importorskip("minari")
+    if name == "lerobot":
+        pytest.importorskip("pyarrow")
+    source = tmp_path / "source"
+    WRITERS[name](source, 0)
+    recording = foreign.open_recording(source, max_bytes=LIMIT)
+    assert (recording.kind == "jaxil pixels") == (name == "own")
+    own.write_pixels(path, recording, origin="a test")
+    count = recording.num_episodes
+    before, after = (load(p, num_episodes=count) for p in (source, path))
+    np.testing.assert_array_equal(before.frames, after.frames)
+    assert before.frames.std() > 0
+    for name in ("actions", "task_rewards"):
+        one, other = getattr(before, name), getattr(after, name)
+        assert (one is None) == (other is None)
+        if one is not None:
+            np.testing.assert_array_equal(one, other)
+
+
+def test_a_dataset_with_a_preview_is_no_folder_of_videos(tmp_path):
+    folder = tmp_path / "replay"
+    foreign_files.write_replays(folder, 0)
+    foreign_files.write_video(folder / "preview.mp4", 0)
+    recording = foreign.open_recording(folder, max_bytes=LIMIT)
+    assert "replay" in recording.kind
+
+
+def test_the_fuzzer_knows_every_format():
+    assert len(WRITERS) == len(foreign._READERS)
+    assert len(test_readers_fuzz.FORMATS) == len(WRITERS)

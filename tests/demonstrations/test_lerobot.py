@@ -1,0 +1,520 @@
+"""LeRobot datasets: one of its own, others of known content, and hostile ones."""
+
+import json
+import os
+import pathlib
+import shutil
+
+import numpy as np
+import pytest
+
+from jaxil.demonstrations.readers import (
+    clips,
+    lerobot,
+    lerobot_file,
+    lerobot_index,
+    messages,
+)
+from jaxil.demonstrations.readers.recording import FormatError
+from tests.demonstrations.foreign_files import (
+    CAMERA,
+    make_lerobot_dataset,
+    make_parquet,
+)
+
+pytest.importorskip("pyarrow", reason="pyarrow writes and reads Parquet files")
+
+LIMIT = 2**24
+REAL = pathlib.Path(__file__).parent / "data" / "lerobot_v3"
+EPISODES_FILE = "meta/episodes/chunk-000/file-000.parquet"
+DATA_FILE = "data/chunk-000/file-000.parquet"
+VIDEO_FILE = f"videos/{CAMERA}/chunk-000/file-000.mp4"
+
+
+def make_episode(num_frames, seed=0):
+    rng = np.random.default_rng(seed)
+    return {
+        "frames": rng.integers(0, 256, (num_frames, 8, 8, 3), dtype=np.uint8),
+        "action": rng.uniform(-1, 1, (num_frames, 2)).astype(np.float32),
+        "next.reward": rng.uniform(size=num_frames).astype(np.float32),
+    }
+
+
+EPISODES = [make_episode(3), make_episode(5, 1), make_episode(2, 2)]
+
+
+def read(path, **changes):
+    recording = lerobot.open_recording(path, **({"max_bytes": LIMIT} | changes))
+    return recording, list(recording.episodes)
+
+
+def assert_same(episodes, expected):
+    for episode, stored in zip(episodes, expected, strict=True):
+        np.testing.assert_array_equal(episode.frames, stored["frames"])
+        np.testing.assert_array_equal(episode.actions, stored["action"][:-1])
+        np.testing.assert_array_equal(episode.rewards, stored["next.reward"][:-1])
+        for array, kind in zip(episode, ("uint8", "float32", "float32"), strict=True):
+            assert array.dtype == kind
+
+
+@pytest.fixture(name="path")
+def _path(tmp_path):
+    make_lerobot_dataset(tmp_path / "dataset", EPISODES)
+    return tmp_path / "dataset"
+
+
+class Here:
+    """In the place of a process that reads Parquet files, since it starts slowly."""
+
+    def __init__(self, module, path, **arguments):
+        assert module == lerobot_file.__name__
+        path.stat()
+        self.messages = lerobot_file.read(path, **arguments)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        del self.messages
+
+    def receive(self, max_bytes):
+        del max_bytes
+        message = next(self.messages, None)
+        if message is None:
+            raise FormatError("ended")
+        return message
+
+
+@pytest.fixture(name="here")
+def _here(monkeypatch):
+    monkeypatch.setattr(messages, "open_no_more_files", lambda: None)
+    monkeypatch.setattr(messages, "open_child", Here)
+    monkeypatch.setattr(messages, "receive", Here.receive)
+
+
+def set_info(path, **values):
+    file = path / "meta" / "info.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **values}))
+
+
+def change_rows(path, file, function):
+    """Applies `function` to a Parquet file's rows, a list of dicts."""
+    from pyarrow import parquet
+
+    rows = parquet.read_table(path / file).to_pylist()
+    make_parquet(path / file, function(rows) or rows)
+
+
+# --- what is read ---------------------------------------------------------------------
+
+
+def test_what_lerobot_writes_is_read():
+    assert lerobot.recognises(REAL)
+    recording, episodes = read(REAL)
+    assert recording.num_episodes == 2
+    assert recording.frames_per_second == 10
+    assert recording.notes == ()
+    for index, (episode, length) in enumerate(zip(episodes, (4, 6), strict=True)):
+        times = np.arange(length)
+        levels = (40 * index + 20 * times)[:, None, None, None]
+        assert episode.frames.shape == (length, 16, 16, 3)
+        # The codec may be off by a few grey levels.
+        np.testing.assert_allclose(episode.frames.astype(int) - levels, 0, atol=3)
+        # What was done last led to no frame.
+        actions = np.stack([times[:-1], np.full(length - 1, -index)], axis=1)
+        np.testing.assert_array_equal(episode.actions, actions)
+        np.testing.assert_array_equal(episode.rewards, times[:-1] / 8)
+
+
+@pytest.mark.parametrize("as_images", [False, True])
+def test_frames_actions_and_rewards_are_those_that_were_written(tmp_path, as_images):
+    path = tmp_path / "dataset"
+    make_lerobot_dataset(path, EPISODES, as_images=as_images, per_file=3)
+    assert lerobot.recognises(path)
+    assert_same(read(path)[1], EPISODES)
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize("as_images", [False, True])
+@pytest.mark.parametrize("per_file", [1, 2])
+@pytest.mark.parametrize("gap", [0, 2])
+def test_episodes_are_found_in_their_files(tmp_path, as_images, per_file, gap):
+    options = {"as_images": as_images, "per_file": per_file, "gap": gap}
+    make_lerobot_dataset(tmp_path / "dataset", EPISODES, **options)
+    assert_same(read(tmp_path / "dataset")[1], EPISODES)
+
+
+@pytest.mark.usefixtures("here")
+def test_episodes_are_read_when_they_are_asked_for(path, monkeypatch):
+    frames, messages_received = [], []
+    stack, receive = lerobot._stack, messages.receive
+    monkeypatch.setattr(
+        lerobot, "_stack", lambda *args: frames.append(args) or stack(*args)
+    )
+    monkeypatch.setattr(
+        messages,
+        "receive",
+        lambda *args, **limits: (
+            messages_received.append(args) or receive(*args, **limits)
+        ),
+    )
+    recording = lerobot.open_recording(path, max_bytes=LIMIT)
+    assert (len(messages_received), len(frames)) == (1, 0)  # where the episodes are
+    next(recording.episodes)
+    assert (len(messages_received), len(frames)) == (2, 1)
+
+
+@pytest.mark.usefixtures("here")
+def test_which_columns_are_actions_and_rewards(tmp_path):
+    base = {"frames": EPISODES[0]["frames"]}
+    numbers = np.array([0.5, 0.25, 0.125], np.float32)
+    cases = {
+        "none": ({}, None, None),
+        "one number": ({"action": numbers}, [[0.5], [0.25]], None),
+        "reward": ({"reward": numbers}, None, [0.5, 0.25]),
+        "both": ({"reward": numbers, "next.reward": 2 * numbers}, None, [1, 0.5]),
+        "discrete": ({"action": np.array([0, 1, 2])}, None, None),
+    }
+    for name, (columns, actions, rewards) in cases.items():
+        make_lerobot_dataset(tmp_path / name, [{**base, **columns}])
+        recording, (episode,) = read(tmp_path / name)
+        for array, expected in ((episode.actions, actions), (episode.rewards, rewards)):
+            assert (array is None) == (expected is None), name
+            if array is not None:
+                assert array.tolist() == expected, name
+        assert len(recording.notes) == (actions is None), name
+
+
+# --- faults ---------------------------------------------------------------------------
+
+
+def set_row(row, **values):
+    """Returns a change of one row; "_" stands for "/" in names."""
+
+    def function(rows):
+        rows[row].update(
+            {name.replace("__", "/"): value for name, value in values.items()}
+        )
+
+    return function
+
+
+def without(name):
+    return lambda rows: [
+        {key: value for key, value in row.items() if key != name} for row in rows
+    ]
+
+
+TIME = f"videos/{CAMERA}/from_timestamp"
+ROW_FAULTS = {
+    "no column": (EPISODES_FILE, without("length"), "has no column length in file-000"),
+    "an episode too few": (EPISODES_FILE, lambda rows: rows[:2], "has 2 episodes in"),
+    "an episode twice": (
+        EPISODES_FILE,
+        set_row(1, episode_index=0),
+        "not those from 0",
+    ),
+    "words": (
+        EPISODES_FILE,
+        lambda rows: [{**row, "length": "many"} for row in rows],
+        "has length of type string, where numbers belong",
+    ),
+    "fractions": (
+        EPISODES_FILE,
+        lambda rows: [{**row, "length": 2.5} for row in rows],
+        "has a column length of type float64",
+    ),
+    "an absent number": (
+        EPISODES_FILE,
+        set_row(1, length=None),
+        "has rows without a number in length",
+    ),
+    "an episode of one frame": (EPISODES_FILE, set_row(0, length=1), "has 1 frames in"),
+    "a file that is not there": (
+        EPISODES_FILE,
+        set_row(0, data__chunk_index=7),
+        None,
+    ),
+    "a negative time": (EPISODES_FILE, set_row(0, **{TIME: -1.0}), "from second -1.0"),
+    "no time": (EPISODES_FILE, set_row(0, **{TIME: float("nan")}), "from second nan"),
+    "overlapping": (
+        EPISODES_FILE,
+        set_row(1, **{TIME: 0.1}),
+        "has an episode 1 that begins in the one before",
+    ),
+    "behind the end": (
+        EPISODES_FILE,
+        set_row(1, **{TIME: 0.6}),
+        "has a video that ends after 2 of the 5 frames of episode 1",
+    ),
+    "another length": (
+        EPISODES_FILE,
+        set_row(0, length=2),
+        "has other rows in file-000.parquet than the 2 of episode 0",
+    ),
+    "a frame twice": (DATA_FILE, set_row(1, frame_index=0), "has other rows"),
+    "another episode": (DATA_FILE, set_row(0, episode_index=1), "has other rows"),
+    "no rows": (DATA_FILE, lambda rows: rows[:3], "ended|broke the program"),
+    "no action": (DATA_FILE, set_row(1, action=None), "without a number in action"),
+    "a short action": (
+        DATA_FILE,
+        set_row(1, action=[1.0]),
+        "unequal lengths in action",
+    ),
+    "an action of nothing": (
+        DATA_FILE,
+        set_row(1, action=[1.0, None]),
+        "without a num",
+    ),
+    "two rewards": (
+        DATA_FILE,
+        lambda rows: [{**row, "next.reward": [1.0, 2.0]} for row in rows],
+        "has 6 rewards in episode 0, where 3 belong",
+    ),
+}
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize("name", ROW_FAULTS)
+def test_rows_that_break_the_rules_are_refused(path, name):
+    file, function, message = ROW_FAULTS[name]
+    change_rows(path, file, function)
+    kind = FormatError if message else FileNotFoundError
+    with pytest.raises(kind, match=message) as caught:
+        read(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize(
+    ("picture", "message"),
+    [
+        ({"bytes": None, "path": "/etc/passwd"}, "keeps its pictures in other files"),
+        ({"bytes": b"\x89PNG\r\n\x1a\n", "path": ""}, "has a damaged picture 0"),
+        ({"path": "a.png"}, "has pictures of type struct"),
+        ("a.png", "has pictures of type string"),
+    ],
+)
+def test_pictures_that_cannot_be_read_are_refused(tmp_path, picture, message):
+    path = tmp_path / "dataset"
+    make_lerobot_dataset(path, EPISODES, as_images=True)
+    change_rows(
+        path, DATA_FILE, lambda rows: [{**row, CAMERA: picture} for row in rows]
+    )
+    with pytest.raises(FormatError, match=message):
+        read(path)
+
+
+def feature(kind):
+    return {"dtype": kind, "shape": [1]}
+
+
+INFO_FAULTS = {
+    "old": (
+        {"codebase_version": "v2.1"},
+        "codebase_version 'v2.1'; only v3 can be read",
+    ),
+    "no version": ({"codebase_version": 3}, "codebase_version 3"),
+    "no rate": ({"fps": 0}, "has fps=0"),
+    "endless rate": ({"fps": float("inf")}, "has fps=inf"),
+    "rate beyond numbers": ({"fps": 10**400}, "has fps=1000"),
+    "rate in words": ({"fps": "10"}, "has fps='10'"),
+    "another rate": ({"fps": 20}, "video file-000.mp4 of 10 frames per second, where"),
+    "no episodes": ({"total_episodes": 0}, "has total_episodes=0"),
+    "many episodes": ({"total_episodes": 10**9}, "has total_episodes=1000000000"),
+    "no camera": ({"features": {"action": feature("float32")}}, "has 0 cameras"),
+    "two cameras": (
+        {"features": {"left": feature("video"), "right": feature("image")}},
+        "has 2 cameras, not one: left, right",
+    ),
+    "no features": ({"features": [1]}, "has no features"),
+    "broken feature": ({"features": {"action": 3}}, "has 0 cameras"),
+    "no path": ({"data_path": None}, "has no data_path"),
+    "upwards": (
+        {"data_path": "data/../../x.parquet"},
+        "refers to a file 'data/../../x",
+    ),
+    "absolute": ({"data_path": "/etc/passwd"}, "refers to a file '/etc/passwd', which"),
+    "empty": ({"video_path": ""}, "refers to a file ''"),
+    "zero byte": ({"video_path": "a\0b"}, "which is not in it"),
+    "half a letter": ({"data_path": "\ud800"}, "which is not in it"),
+    "unreadable camera": ({"features": {"a\nb": feature("video")}}, "the name 'a"),
+    "unreadable cameras": (
+        {"features": {"\ud800": feature("video"), "b": feature("video")}},
+        r"has 2 cameras, not one: \?, b",
+    ),
+    "camera as a path": (
+        {
+            "features": {"../../..": feature("video")},
+            "video_path": "videos/{video_key}/x.mp4",
+        },
+        "has no column",
+    ),
+}
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize("name", INFO_FAULTS)
+def test_information_that_does_not_fit_is_refused(path, name):
+    values, message = INFO_FAULTS[name]
+    set_info(path, **values)
+    with pytest.raises(FormatError, match=message) as caught:
+        read(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.usefixtures("here")
+def test_a_camera_whose_name_leads_outside_is_refused(path):
+    camera = "../../.."
+    set_info(path, features={camera: feature("video")})
+    change_rows(
+        path,
+        EPISODES_FILE,
+        lambda rows: [
+            {name.replace(CAMERA, camera): value for name, value in row.items()}
+            for row in rows
+        ],
+    )
+    with pytest.raises(
+        FormatError, match=r"refers to a file 'videos/\.\./\.\./\.\./ch"
+    ):
+        read(path)
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize(
+    "template",
+    [
+        "{chunk_index:99999999d}",
+        "{chunk_index.__class__}",
+        "{0}",
+        "{",
+        "{file_index!r}",
+    ],
+)
+def test_templates_are_no_programs(path, template):
+    set_info(path, data_path=template)
+    with pytest.raises(FileNotFoundError) as caught:
+        read(path)
+    assert template in str(caught.value)
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize(
+    "name", [EPISODES_FILE, DATA_FILE, VIDEO_FILE, "meta/info.json"]
+)
+@pytest.mark.parametrize("folder", [False, True])
+def test_links_that_lead_outside_are_refused(path, tmp_path, name, folder):
+    place = (path / name).parent if folder else path / name
+    outside = tmp_path / "outside"
+    place.rename(outside)
+    place.symlink_to(outside)
+    with pytest.raises(FormatError, match="has a link to somewhere else in"):
+        read(path)
+    place.unlink()
+    place.symlink_to(place)  # to itself
+    with pytest.raises((FormatError, OSError)):
+        read(path)
+
+
+@pytest.mark.usefixtures("here")
+def test_links_within_the_folder_are_followed(path):
+    (path / DATA_FILE).rename(path / "data" / "moved.parquet")
+    (path / DATA_FILE).symlink_to(pathlib.Path("..") / "moved.parquet")
+    link = path.with_name("link")
+    link.symlink_to(path)
+    assert_same(read(link)[1], EPISODES)
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize("as_images", [False, True])
+def test_more_than_the_limit_is_refused_and_the_limit_itself_is_not(
+    tmp_path, as_images
+):
+    path = tmp_path / "dataset"
+    make_lerobot_dataset(path, EPISODES, as_images=as_images)
+    limit = 5 * 8 * 8 * 3  # of the longest episode; PNGs of noise are larger
+    if as_images:
+        limit *= 2
+    assert_same(read(path, max_bytes=limit)[1], EPISODES)
+    limit = 5 * 8 * 8 * 3 - 1
+    with pytest.raises(FormatError, match=f"bytes.*, more than the {limit} "):
+        read(path, max_bytes=limit)
+
+
+def test_few_bytes_that_mean_many_numbers_are_refused(path):
+    import pyarrow
+    from pyarrow import parquet
+
+    num_rows = 3_000_000
+    columns = {
+        name: pyarrow.repeat(value, num_rows)
+        for name, value in {"episode_index": 0, "frame_index": 0, "action": 0.0}.items()
+    }
+    columns["next.reward"] = columns["action"]
+    parquet.write_table(pyarrow.table(columns), path / DATA_FILE)
+    assert (path / DATA_FILE).stat().st_size < 60_000
+    with pytest.raises(FormatError, match="belong together, more than the 1000000"):
+        read(path, max_bytes=10**6)
+
+
+def test_faults_pass_from_one_process_to_the_other(path):
+    change_rows(path, DATA_FILE, set_row(4, action=None))
+    with pytest.raises(FormatError, match="has rows without a number in action"):
+        read(path)
+
+
+@pytest.mark.parametrize("name", [EPISODES_FILE, DATA_FILE, VIDEO_FILE])
+def test_a_file_cut_off_is_refused(path, name):
+    content = (path / name).read_bytes()
+    (path / name).write_bytes(content[: len(content) // 2])
+    with pytest.raises(FormatError, match="damaged"):
+        read(path)
+
+
+def test_without_pyarrow_one_is_told_what_to_install(path, monkeypatch):
+    monkeypatch.setattr(lerobot.importlib.util, "find_spec", lambda _: None)
+    with pytest.raises(FormatError, match=r"pyarrow: pip install 'jaxil\[lerobot\]'"):
+        lerobot.open_recording(path, max_bytes=LIMIT)
+
+
+@pytest.mark.parametrize("content", ["{", "[]", "[" * 10**5, " " * 2**25])
+def test_information_that_is_no_json_is_refused(path, content):
+    (path / "meta" / "info.json").write_text(content)
+    with pytest.raises(FormatError, match=r"has a info.json"):
+        lerobot.open_recording(path, max_bytes=LIMIT)
+
+
+def test_folders_that_are_something_else(tmp_path):
+    assert not lerobot.recognises(tmp_path)
+    assert not lerobot.recognises(tmp_path / "none")
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text("{}")
+    assert not lerobot.recognises(tmp_path)
+    shutil.rmtree(tmp_path / "meta")
+    with pytest.raises(FileNotFoundError):
+        lerobot.open_recording(tmp_path, max_bytes=LIMIT)
+
+
+def test_nothing_is_left_running_when_nobody_listens_any_more(path, monkeypatch):
+    closed = []
+    decode = clips.decode
+
+    def watched(*args, **limits):
+        try:
+            yield from decode(*args, **limits)
+        finally:
+            closed.append(True)
+
+    monkeypatch.setattr(clips, "decode", watched)
+    recording = lerobot.open_recording(path, max_bytes=LIMIT)
+    next(recording.episodes)
+    assert not closed
+    del recording  # a warning about a program that still runs would be an error
+    assert closed
+
+
+def test_true_paths_are_inside():
+    assert lerobot_index.inside(REAL, "meta/info.json") == pathlib.Path(
+        os.path.realpath(REAL / "meta" / "info.json")
+    )

@@ -1,0 +1,403 @@
+"""Replays' folders: alignment, order, what is left alone, damage and zip bombs."""
+
+import io
+import os
+import struct
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxil.demonstrations.readers import replays
+from jaxil.demonstrations.readers.recording import FormatError
+from tests.demonstrations.foreign_files import dreamer_entries, drqv2_entries, play
+
+MAX_BYTES = 10**6
+WRITERS = {
+    "DrQ-v2 replay": drqv2_entries,
+    "DreamerV2 or V-D4RL replay": dreamer_entries,
+}
+
+
+def read(path, *, max_bytes=MAX_BYTES):
+    recording = replays.open_recording(path, max_bytes=max_bytes)
+    episodes = list(recording.episodes)
+    assert len(episodes) == recording.num_episodes
+    return episodes
+
+
+def save(path, arrays, **changes):
+    """Writes an archive; a change of None takes an array away."""
+    arrays = {k: v for k, v in {**arrays, **changes}.items() if v is not None}
+    np.savez_compressed(path, allow_pickle=True, **arrays)
+
+
+def assert_shows(episode, played):
+    for shown, expected in zip(episode, played, strict=True):
+        np.testing.assert_array_equal(shown, expected, strict=True)
+
+
+PLAYED = play(np.random.default_rng(0), 5)
+ENTRIES = dreamer_entries(*PLAYED)
+
+
+@pytest.fixture(name="path")
+def _path(tmp_path):
+    """A sound file of one episode."""
+    path = tmp_path / "episode.npz"
+    save(path, ENTRIES)
+    return path
+
+
+# --- what is read ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_episodes_come_by_name_with_actions_beside_their_frames(tmp_path, kind):
+    played = [play(np.random.default_rng(k), 3 + k) for k in range(3)]
+    for index in (2, 0, 1):
+        name = f"20220101T00000{index}_{9 - index}_{3 + index}.npz"
+        save(tmp_path / name, WRITERS[kind](*played[index]))
+    recording = replays.open_recording(tmp_path, max_bytes=MAX_BYTES)
+    assert recording.kind == kind
+    assert recording.notes == ()
+    for episode, expected in zip(recording.episodes, played, strict=True):
+        assert_shows(episode, expected)
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    num_steps=st.integers(1, 5),
+    size=st.sampled_from([4, 8, 64, 84]),
+    num_stacked=st.integers(1, 4),
+    channels_last=st.booleans(),
+)
+def test_stacks_of_any_size(
+    tmp_path_factory, num_steps, size, num_stacked, channels_last
+):
+    played = play(np.random.default_rng(size), num_steps, size)
+    entries = drqv2_entries(*played, num_stacked)
+    if channels_last:
+        entries["observation"] = entries["observation"].transpose(0, 2, 3, 1)
+    path = tmp_path_factory.mktemp("any") / "episode.npz"
+    np.savez(path, allow_pickle=False, **entries)
+    assert replays.recognises(path)
+    (episode,) = read(path)
+    assert_shows(episode, played)
+
+
+def test_channels_first_images_and_older_files(path):
+    image = PLAYED[0].transpose(0, 3, 1, 2)
+    save(path, ENTRIES, image=image, is_first=None, is_terminal=None)
+    (episode,) = read(path)
+    assert_shows(episode, PLAYED)
+
+
+def test_numbers_of_other_types(path):
+    action = ENTRIES["action"].astype(">f8")
+    save(path, ENTRIES, action=action, reward=np.arange(6, dtype=np.int16))
+    (episode,) = read(path)
+    assert_shows(episode, (*PLAYED[:2], np.arange(1, 6, dtype=np.float32)))
+
+
+def test_what_else_is_in_the_folder_is_left_alone(path, tmp_path):
+    (tmp_path / "a.txt").write_text("text")
+    (tmp_path / "a.pt").write_bytes(b"PK\3\4 not read")
+    (tmp_path / "folder.npz").mkdir()
+    os.mkfifo(tmp_path / "pipe.npz")  # opening it would wait for ever
+    np.savez(tmp_path / "b.npz", x=np.zeros(3))
+    save(tmp_path / "c.npz", ENTRIES, qpos=np.zeros(3), metadata=np.array("{}"))
+    assert replays.recognises(tmp_path)
+    assert not replays.recognises(tmp_path / "pipe.npz")
+    recording = replays.open_recording(tmp_path, max_bytes=MAX_BYTES)
+    assert recording.num_episodes == 1
+    assert recording.notes == ("2 of its 3 .npz files hold no episode.",)
+    assert_shows(next(recording.episodes), PLAYED)
+    with pytest.raises(FormatError, match="holds no episodes"):
+        replays.open_recording(tmp_path / "pipe.npz", max_bytes=MAX_BYTES)
+
+
+def test_names_in_an_archive_are_no_paths(path, tmp_path):
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("../../escaped.npy", b"x")
+        archive.writestr("/tmp/escaped.npy", b"x")
+    (episode,) = read(path)
+    assert_shows(episode, PLAYED)
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+    assert not (tmp_path.parent.parent / "escaped.npy").exists()
+
+
+@pytest.mark.parametrize(
+    "names",
+    ["qpos metadata", "frames_0 metadata", "image action", "action reward", "x"],
+)
+def test_other_archives_are_not_recognised(path, tmp_path, names):
+    assert replays.recognises(path)
+    np.savez(path, allow_pickle=False, **{name: np.zeros(3) for name in names.split()})
+    assert not replays.recognises(path)
+    assert not replays.recognises(tmp_path)
+    for place in (path, tmp_path):
+        with pytest.raises(FormatError, match=r"holds no episodes: no \.npz file"):
+            replays.open_recording(place, max_bytes=MAX_BYTES)
+
+
+def test_nothing_is_recognised_where_nothing_is(tmp_path):
+    assert not replays.recognises(tmp_path)
+    assert not replays.recognises(tmp_path / "none")
+    (tmp_path / "a.npz").write_bytes(b"")
+    assert not replays.recognises(tmp_path / "a.npz")
+    with pytest.raises(OSError, match="No such file"):
+        replays.open_recording(tmp_path / "none", max_bytes=MAX_BYTES)
+
+
+def test_one_episode_is_in_memory_at_a_time(tmp_path):
+    num_bytes = 40 * 84 * 84 * 9
+    for index in range(5):
+        played = play(np.random.default_rng(index), 39, 84)
+        np.savez_compressed(
+            tmp_path / f"{index}.npz", allow_pickle=False, **drqv2_entries(*played)
+        )
+    tracemalloc.start()
+    try:
+        for _ in replays.open_recording(tmp_path, max_bytes=2 * num_bytes).episodes:
+            pass
+        # As compressed, as unpacked, as an array, and of single frames.
+        assert tracemalloc.get_traced_memory()[1] < 4 * num_bytes
+    finally:
+        tracemalloc.stop()
+
+
+# --- what is refused ------------------------------------------------------------------
+
+
+NAN = np.full((6, 2), np.nan, np.float32)
+WRONG = {
+    "more than one episode": (
+        {"is_first": np.arange(6) % 3 == 0},
+        "more than one episode: is_first is true again",
+    ),
+    "text for flags": ({"is_first": np.array(["no"] * 6)}, "has is_first of type <U2"),
+    "DreamerV3": ({"stepid": np.zeros((6, 20), np.uint8)}, "begins with an action"),
+    "actions after frames": (
+        {"action": np.roll(ENTRIES["action"], -1, axis=0)},
+        "begins with an action, where the reset's zeros belong",
+    ),
+    "NaN for the reset": ({"action": NAN}, "begins with an action"),
+    "an action too few": (
+        {"action": ENTRIES["action"][:-1]},
+        r"unequal length, or too few steps: .*'action': \(5, 2\)",
+    ),
+    "no steps": ({k: v[:1] for k, v in ENTRIES.items()}, "too few steps"),
+    "a number": ({"reward": np.float32(0)}, "unequal length"),
+    "actions without axis": (
+        {"action": ENTRIES["action"][:, 0]},
+        r"actions of type float32 and shape \(6,\), where numbers on 2 axes",
+    ),
+    "rewards with axes": (
+        {"reward": np.zeros((6, 2))},
+        r"rewards of type float64 and shape \(6, 2\), where numbers on 1 axes",
+    ),
+    "complex actions": (
+        {"action": ENTRIES["action"].astype(complex)},
+        "actions of type complex128",
+    ),
+    "grey pictures": (
+        {"image": np.zeros((6, 8, 8, 1), np.uint8)},
+        r"shape \(6, 8, 8, 1\), where coloured pictures",
+    ),
+    "grey stacks": (
+        {"image": np.zeros((6, 4, 84, 84), np.uint8)},
+        "where coloured pictures",
+    ),
+    "states": (
+        {"image": np.zeros((6, 9))},
+        "observations of type float64, where uint8",
+    ),
+    "flat pictures": (
+        {"image": np.zeros((6, 192), np.uint8)},
+        r"shape \(6, 192\), where coloured",
+    ),
+    "both ways": (
+        {"image": np.zeros((6, 3, 3, 3), np.uint8)},
+        "doesn't tell whether channels come first or last",
+    ),
+    "objects": ({"action": np.array([{}] * 6, object)}, "action of Python objects"),
+    "records": (
+        {"action": np.zeros(6, [("x", float)])},
+        r"unreadable array action \(not the header of a plain array",
+    ),
+}
+
+
+@pytest.mark.parametrize("in_folder", [True, False])
+@pytest.mark.parametrize("name", WRONG)
+def test_files_that_break_the_rules_are_refused(path, name, in_folder):
+    changes, message = WRONG[name]
+    save(path, ENTRIES, **changes)
+    with pytest.raises(FormatError, match=message) as caught:
+        read(path.parent if in_folder else path)
+    assert str(caught.value).startswith("holds episode.npz, which ") == in_folder
+    assert "\n" not in str(caught.value)
+
+
+def test_an_array_larger_than_may_be_read(path):
+    # 6 pictures of 8 x 8 pixels, after a header of 128 bytes.
+    assert len(read(path, max_bytes=6 * 192 + 128)) == 1
+    with pytest.raises(
+        FormatError, match="image of 1280 bytes, more than the 1279 that"
+    ):
+        read(path, max_bytes=1279)
+
+
+def test_a_file_cut_off_anywhere_is_refused(path, tmp_path):
+    content = path.read_bytes()
+    for length in range(0, len(content), 61):
+        path.write_bytes(content[:length])
+        for place in (path, tmp_path):
+            with pytest.raises(FormatError, match="cut off"):
+                read(place)
+
+
+def test_a_damaged_file_is_named(tmp_path):
+    for index in range(3):
+        save(tmp_path / f"{index}.npz", ENTRIES)
+    content = bytearray((tmp_path / "1.npz").read_bytes())
+    content[400] ^= 0xFF  # within the compressed pictures
+    (tmp_path / "1.npz").write_bytes(bytes(content))
+    recording = replays.open_recording(tmp_path, max_bytes=MAX_BYTES)
+    assert_shows(next(recording.episodes), PLAYED)
+    with pytest.raises(FormatError, match=r"holds 1\.npz, which is cut off, damaged"):
+        next(recording.episodes)
+
+
+def with_member(path, content, compression=zipfile.ZIP_DEFLATED):
+    """Writes an archive whose action.npy has this content."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, member in {**members, "action.npy": content}.items():
+            archive.writestr(name, member)
+
+
+def npy(header, data=b"", version=b"\1\0"):
+    layout = "<H" if version[0] == 1 else "<I"
+    length = struct.pack(layout, len(header))
+    return b"\x93NUMPY" + version + length + header.encode() + data
+
+
+HEADER = "{{'descr': '{}', 'fortran_order': False, 'shape': {}, }} \n"
+HEADERS = {
+    "nothing": (b"", "unreadable array action"),
+    "no header": (b"\x93NUMPY\1\0\xff\xff", "unreadable array action"),
+    "a later version": (
+        npy(HEADER.format("<f4", "(6, 2)"), version=b"\4\0"),
+        "version",
+    ),
+    "an expression": (npy("__import__('os')\n"), "not the header"),
+    "deep": (npy("(" * 60_000), "not the header"),
+    "deep version 2": (npy("[" * 10**5, version=b"\2\0"), "not the header"),
+    "Python 2": (npy(HEADER.format("<f4", "(6L, 2L)")), "not the header"),
+    "deprecated": (npy(HEADER.format("|a5", "(6, 2)")), "not the header"),
+    "no such type": (npy(HEADER.format("<f3", "(6, 2)")), "unreadable array action"),
+    "no size": (npy(HEADER.format("|S0", "(999999999999, 2)")), "have no size"),
+    "negative": (npy(HEADER.format("<f4", "(-6, -2)"), bytes(48)), "not the header"),
+    "huge": (npy(HEADER.format("<f4", "(999999999999999999, 2)")), "not as long"),
+    "overflow": (
+        npy(HEADER.format("<f4", "(4294967296, 4294967296)")),
+        "not as long as it says",
+    ),
+    "empty and huge": (
+        npy(HEADER.format("<f4", "(0, 999999999999999999)")),
+        "unequal length|too big|too large",
+    ),
+    "many axes": (
+        npy(HEADER.format("<f4", f"({'1, ' * 40})"), bytes(4)),
+        "not the head",
+    ),
+    "too long": (
+        npy(HEADER.format("<f4", "(6, 2)"), bytes(49)),
+        "not as long as it says",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_hostile_headers(path, name):
+    content, message = HEADERS[name]
+    with_member(path, content)
+    with pytest.raises(FormatError, match=message):
+        read(path)
+
+
+def bomb(path, *, unpacked, declared):
+    """Makes action.npy unpack to more, or less, than the archive's directory says."""
+    header = npy(HEADER.format("<f4", f"({unpacked // 8}, 2)"))
+    with_member(path, header + bytes(unpacked - unpacked % 8))
+    with zipfile.ZipFile(path) as archive:
+        size = archive.getinfo("action.npy").file_size
+    content = path.read_bytes()
+    assert content.count(struct.pack("<I", size)) == 2
+    path.write_bytes(
+        content.replace(struct.pack("<I", size), struct.pack("<I", declared))
+    )
+
+
+@pytest.mark.parametrize(
+    ("unpacked", "declared", "message"),
+    [
+        (100_000_000, 200, "cut off, damaged"),
+        (100_000_000, MAX_BYTES, "cut off, damaged"),
+        (800, MAX_BYTES, "not as long as it says"),
+    ],
+)
+def test_sizes_that_are_not_true(path, unpacked, declared, message):
+    bomb(path, unpacked=unpacked, declared=declared)
+    tracemalloc.start()
+    try:
+        with pytest.raises(FormatError, match=message):
+            read(path)
+        assert tracemalloc.get_traced_memory()[1] < 5 * MAX_BYTES
+    finally:
+        tracemalloc.stop()
+
+
+def test_sizes_beyond_the_end_of_the_file(path):
+    with_member(path, b"short", zipfile.ZIP_STORED)
+    content = path.read_bytes().replace(
+        struct.pack("<II", 5, 5), struct.pack("<II", 9 * 10**8, 9 * 10**8)
+    )
+    path.write_bytes(content)
+    tracemalloc.start()
+    try:
+        with pytest.raises(FormatError, match="not as long as it says"):
+            read(path, max_bytes=10**9)
+        assert tracemalloc.get_traced_memory()[1] < MAX_BYTES
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("compression", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_compressions_that_cannot_be_stopped_half_way(path, compression):
+    action = io.BytesIO()
+    np.save(action, ENTRIES["action"], allow_pickle=False)
+    with_member(path, action.getvalue(), compression)
+    with pytest.raises(FormatError, match="packed by a compression that is not read"):
+        read(path)
+
+
+def test_encrypted_members(path):
+    content = path.read_bytes()
+    # Bit 0 of the flags, in each member's header and in the directory.
+    for start, offset in ((b"PK\3\4", 6), (b"PK\1\2", 8)):
+        parts = content.split(start)
+        rest = [
+            bytes([*p[: offset - 4], p[offset - 4] | 1]) + p[offset - 3 :]
+            for p in parts[1:]
+        ]
+        content = start.join([parts[0], *rest])
+    path.write_bytes(content)
+    with pytest.raises(FormatError, match="encrypted"):
+        read(path)

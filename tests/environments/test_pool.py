@@ -1,0 +1,253 @@
+"""Environments in processes: the same episodes, whatever happens to a process.
+
+Spawning takes most of the time: some twenty processes, a second each on an idle core.
+"""
+
+import contextlib
+import functools
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+
+import dm_env
+import numpy as np
+import pytest
+
+from jaxil.environments.interaction import interact, interact_together, join
+from jaxil.environments.pool import EnvironmentsFailed, Pool
+from jaxil.environments.suite import make_environment
+
+ROOT = pathlib.Path(__file__).parent.parent.parent
+STEPS = 4
+LIKE = {"observation": np.zeros(2, np.float32), "frame": np.zeros(1, np.float32)}
+
+
+class Counting:
+    """Episodes of four steps; what is seen at time t of episode e is (10 e + t, pid).
+
+    Its single frame is the first of both. A negative action ends it in its own way.
+    """
+
+    def reset(self, episode):
+        self.episode, self.time = episode, 0
+        return dm_env.restart(self._observation())
+
+    def step(self, action):
+        if action[0] == -1.0:
+            raise ArithmeticError("the simulation exploded")
+        if action[0] == -2.0:
+            os._exit(3)
+        self.time += 1
+        end = dm_env.truncation if self.time == STEPS else dm_env.transition
+        return end(float(action[0]), self._observation(), 0.5)
+
+    def single_observation(self):
+        return self._observation()[:1]
+
+    def _observation(self):
+        return np.array([10 * self.episode + self.time, os.getpid()], np.float32)
+
+
+def without_jax(make):
+    """Makes an environment where jax was never imported, and nowhere else."""
+    environment = make()
+    if "jax" in sys.modules:
+        raise ImportError("jax was imported")
+    return environment
+
+
+def play(pool, num_episodes, act=lambda seen: seen[:, :1] % 10, each_round=None):
+    """Plays whole episodes; returns them by number."""
+    under_way, whole, begun = {}, {}, set()
+
+    def begin(episode):
+        begun.add(episode)
+        return episode < num_episodes
+
+    for number, decisions in enumerate(
+        interact_together(pool, act, first_episode=0, begin=begin)
+    ):
+        assert number < 100, "it goes on and on"
+        episodes = [decision.episode for decision in decisions]
+        assert episodes == sorted(episodes)
+        if each_round is not None:
+            each_round(number, decisions)
+        for decision in decisions:
+            if decision.first_frame is not None:
+                under_way[decision.episode] = []
+            under_way[decision.episode].append(decision)
+            if decision.is_last:
+                assert decision.episode not in whole
+                whole[decision.episode] = join(under_way.pop(decision.episode))
+        if len(whole) == num_episodes:
+            return whole
+    raise AssertionError
+
+
+def counting_pool(size, say=print, **seconds):
+    return Pool(Counting, size, say=say, **LIKE, **seconds)
+
+
+def assert_counted(episodes):
+    for number, episode in episodes.items():
+        times = np.arange(STEPS + 1)
+        np.testing.assert_array_equal(episode.frames[:, 0], 10 * number + times)
+        np.testing.assert_array_equal(episode.actions[:, 0], times[:-1])
+        np.testing.assert_array_equal(episode.task_rewards, times[:-1])
+        np.testing.assert_array_equal(episode.discounts, 0.5)
+
+
+def is_there(pid):
+    try:
+        state = pathlib.Path(f"/proc/{pid}/stat").read_text().rsplit(")")[-1].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return state != "Z"  # dead, and its new parent has not looked yet
+
+
+def wait_until_gone(pids):
+    end = time.monotonic() + 30
+    while any(map(is_there, pids)):
+        assert time.monotonic() < end, "processes were left behind"
+        time.sleep(0.05)
+
+
+def test_episodes_are_those_of_a_single_environment():
+    make = functools.partial(
+        make_environment,
+        "cartpole_swingup",
+        seed=3,
+        action_repeat=200,
+        image_size=16,
+        render_quality="fast",
+    )
+
+    def act(seen):  # anything that depends on all that is seen
+        return np.cos(np.float64(seen).reshape(len(seen), -1).sum(axis=1))[:, None]
+
+    single = make()
+    like = {"observation": single.reset(episode=0).observation}
+    like["frame"] = single.single_observation()
+    pool = Pool(functools.partial(without_jax, make), 2, say=print, **like)
+    with contextlib.closing(pool):
+        found = play(pool, 3, act)
+    expected: list = [[]]
+    for decision in interact(single, lambda seen: act(seen[None])[0], first_episode=0):
+        expected[-1].append(decision)
+        if decision.is_last and len(expected) == 3:
+            break
+        if decision.is_last:
+            expected.append([])
+    single.close()
+    assert sorted(found) == [0, 1, 2]
+    for number, decisions in enumerate(expected):
+        for ours, theirs in zip(found[number], join(decisions), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+            assert ours.dtype == theirs.dtype
+    assert np.ptp(found[0].frames) > 0
+    assert found[0].frames.shape[0] == 6
+
+
+def test_several_processes_play_and_none_is_left():
+    pool = counting_pool(2)
+    pids = pool.pids
+    seen_pids = set()
+
+    def act(seen):
+        seen_pids.update(seen[:, 1])
+        return seen[:, :1] % 10
+
+    assert_counted(play(pool, 5, act))
+    # Pids of seven digits are still exact in float32.
+    assert seen_pids == {float(pid) for pid in pids}
+    pool.close()
+    assert not any(map(is_there, pids))
+    pool.close()  # again does nothing
+
+
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [(signal.SIGKILL, "was killed by SIGKILL"), (signal.SIGSTOP, "not answer for 3 s")],
+)
+def test_a_lost_process_is_replaced_and_its_episode_played_again(number, said):
+    lines, rounds = [], []
+    pool = counting_pool(2, lines.append, step_seconds=3.0)
+    first_pids = pool.pids
+
+    def lose_one(count, decisions):
+        rounds.append([decision.episode for decision in decisions])
+        if count == 1:
+            os.kill(first_pids[0], number)
+
+    with contextlib.closing(pool):
+        assert_counted(play(pool, 4, each_round=lose_one))
+        assert pool.pids[1] == first_pids[1]
+        assert pool.pids[0] != first_pids[0]
+        assert not is_there(first_pids[0])
+    assert rounds[:4] == [[0, 1], [0, 1], [1], [0, 1]]
+    (line,) = lines
+    assert f"environment 0 {'did ' * (number == signal.SIGSTOP)}{said}" in line
+    assert "plays episode 0 from its start" in line
+
+
+def test_an_error_of_the_environment_is_told_in_full():
+    pool = counting_pool(2)
+    pids = pool.pids
+    with contextlib.closing(pool), pytest.raises(EnvironmentsFailed) as caught:
+        play(pool, 2, lambda seen: np.where(seen[:, :1] == 11, -1.0, 1.0))
+    assert "environment 1 raised an error:\nTraceback" in str(caught.value)
+    assert "ArithmeticError: the simulation exploded" in str(caught.value)
+    assert not any(map(is_there, pids))
+
+
+def test_processes_that_never_get_far_are_given_up():
+    lines = []
+    pool = counting_pool(1, lines.append)
+    with contextlib.closing(pool), pytest.raises(EnvironmentsFailed) as caught:
+        play(pool, 9, lambda seen: np.where(seen[:, :1] == 11, -2.0, 1.0))
+    assert "environment 0 ended with status 3" in str(caught.value)
+    assert "process number 4 there" in str(caught.value)
+    assert len(lines) == 3
+
+
+_PARENT = """
+import sys, time
+from tests.environments.test_pool import counting_pool, play
+if __name__ == "__main__":
+    pool = counting_pool(2)
+    play(pool, 2)
+    print(*pool.pids, flush=True)
+    if "raise" in sys.argv:
+        raise RuntimeError
+    time.sleep(1000)
+"""
+
+
+@pytest.mark.parametrize("way", ["kill", "raise"])
+def test_processes_end_with_their_parent(way, tmp_path):
+    script = tmp_path / "parent.py"
+    script.write_text(_PARENT)
+    parent = subprocess.Popen(
+        [sys.executable, str(script), way],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert parent.stdout is not None
+    pids = [int(word) for word in parent.stdout.readline().split()]
+    assert len(pids) == 2
+    if way == "kill":
+        assert all(map(is_there, pids))
+        # Ctrl-C goes to all processes of a terminal; the parent alone decides.
+        for pid in pids:
+            os.kill(pid, signal.SIGINT)
+        time.sleep(0.2)
+        assert all(map(is_there, pids))
+        parent.kill()
+    parent.communicate(timeout=60)
+    wait_until_gone(pids)

@@ -1,0 +1,197 @@
+"""Compiling our own convolutions: once, by whom, and what is said if it can't be."""
+
+import configparser
+import os
+import pathlib
+import shutil
+import stat
+
+import jax
+import pytest
+
+from jaxil import config as jaxil_config
+from jaxil import doctor
+from jaxil.native import build
+from jaxil.training import assembly
+
+NOT_FOR_THESE = (
+    {"compute_dtype": "bfloat16"},
+    {"observation": "state"},
+    {"encoder.channels": (32, 32, 33, 32)},
+    {
+        "encoder.channels": (32,) * 9,
+        "encoder.kernel_sizes": (3,) * 9,
+        "encoder.strides": (2, *(1,) * 8),
+    },
+)
+
+
+def changed(config, changes):
+    """Returns a copy with other values, by dotted name."""
+    config = config.copy_and_resolve_references()
+    config.update_from_flattened_dict(changes)
+    return config
+
+
+@pytest.fixture(autouse=True)
+def _forgotten(monkeypatch):
+    """What this process knows about the library is asked anew."""
+    monkeypatch.setattr(build, "problem", build.problem.__wrapped__)
+
+
+@pytest.fixture
+def without_compiler(monkeypatch, tmp_path):
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path / "nothing"))
+    monkeypatch.setattr(build.startup, "compilation_folder", lambda: tmp_path / "cache")
+
+
+def compiler_that(tmp_path, script):
+    path = tmp_path / "compiler"
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return str(path)
+
+
+def test_is_compiled_once_and_leaves_nothing_else(tmp_path):
+    folder = tmp_path / "not" / "yet"
+    path = build.build(folder)
+    when = path.stat().st_mtime_ns
+    assert build.build(folder) == path
+    assert path.stat().st_mtime_ns == when
+    assert os.listdir(folder) == [path.name]
+
+
+def test_a_wheel_has_all_sources():
+    # Tests run from the tree, where a file that is not packed would not be missed.
+    root = pathlib.Path(build.__file__).parents[2]
+    setup = configparser.ConfigParser()
+    setup.read(root / "setup.cfg")
+    patterns = setup["options.package_data"]["jaxil"].split(",")
+    packed = {path for each in patterns for path in (root / "jaxil").glob(each.strip())}
+    sources = {*root.glob("jaxil/**/*.c"), *root.glob("jaxil/**/*.h")}
+    assert len(sources) > 1
+    assert sources <= packed
+
+
+def test_other_flags_are_another_library(tmp_path):
+    assert build.build(tmp_path) != build.build(tmp_path, (*build.FLAGS, "-g"))
+    assert len(os.listdir(tmp_path)) == 2
+
+
+def test_the_users_compiler_is_taken_with_its_options(tmp_path, monkeypatch):
+    seen = tmp_path / "seen"
+    real = shutil.which("gcc")
+    script = f'echo "$1" > {seen}; shift; exec {real} "$@"'
+    monkeypatch.setenv("CC", compiler_that(tmp_path, script) + " --first")
+    assert build.build(tmp_path / "cache").exists()
+    assert seen.read_text() == "--first\n"
+
+
+@pytest.mark.usefixtures("without_compiler")
+def test_without_a_compiler_xlas_convolutions_are_used():
+    assert "apt-get install gcc libc6-dev" in (build.problem() or "")
+    config = jaxil_config.default_config()
+    assert not assembly.uses_native_convolutions(config)
+    networks = assembly.make_networks(config, 1, 0.5)
+    assert not networks.encoder.native
+    (finding,) = doctor.convolutions()
+    assert finding.level == "warning"
+    assert "apt-get install gcc libc6-dev" in finding.value
+
+
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [
+        ("echo 'encoder.c:1: error: no' >&2; exit 1", "encoder.c:1: error: no"),
+        ("exit 3", "no message"),
+        ("echo text > $9; exit 0", "too short"),  # a file that is no library
+        ("exit 0", "no message"),
+    ],
+)
+def test_a_compiler_that_fails_is_named(tmp_path, monkeypatch, script, said):
+    compiler = compiler_that(tmp_path, script)
+    monkeypatch.setenv("CC", compiler)
+    folder = tmp_path / "cache"
+    monkeypatch.setattr(build.startup, "compilation_folder", lambda: folder)
+    problem = build.problem()
+    assert problem is not None
+    assert said in problem
+    assert "\n" not in problem
+    assert len(list(folder.iterdir())) == said.count("short")
+
+
+def test_a_compiler_that_is_not_there_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", str(tmp_path / "missing"))
+    with pytest.raises(build.BuildError, match="missing"):
+        build.build(tmp_path)
+
+
+def test_an_older_processor_is_named(tmp_path):
+    flags = [flag for flag in build.FLAGS if not flag.startswith("-march")]
+    with pytest.raises(build.BuildError, match="processors with AVX2 and FMA"):
+        build.build(tmp_path, (*flags, "-march=x86-64"))
+
+
+def test_a_compiler_that_hangs_is_given_up(tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", compiler_that(tmp_path, "exec sleep 60"))
+    monkeypatch.setattr(build, "_SECONDS", 1.0)
+    with pytest.raises(build.BuildError, match="takes more than 1 s"):
+        build.build(tmp_path / "cache")
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(build.BuildError, match="file/cache can't be written"):
+        build.build(tmp_path / "file" / "cache")
+
+
+def test_it_is_for_cpus_only(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert "gpu" in (build.problem() or "")
+    assert list(doctor.convolutions()) == []
+
+
+def test_the_config_chooses():
+    config = jaxil_config.default_config()
+    assert assembly.uses_native_convolutions(config)
+    assert assembly.make_networks(config, 1, 0.5).encoder.native
+    (finding,) = doctor.convolutions()
+    assert finding.level == "ok"
+    for changes in NOT_FOR_THESE:
+        assert not assembly.uses_native_convolutions(changed(config, changes))
+    config.encoder.convolutions = "xla"
+    assert not assembly.uses_native_convolutions(config)
+
+
+@pytest.mark.parametrize("changes", NOT_FOR_THESE)
+def test_who_insists_is_told_what_they_are_not_for(changes):
+    config = jaxil_config.default_config()
+    config.encoder.convolutions = "native"
+    assert assembly.problems(config) == []
+    (fault,) = assembly.problems(changed(config, changes))
+    assert f"{next(iter(changes))}=" in fault
+
+
+@pytest.mark.usefixtures("without_compiler")
+def test_who_insists_is_told_before_anything_starts():
+    config = jaxil_config.default_config()
+    config.encoder.convolutions = "native"
+    (fault,) = assembly.problems(config)
+    assert "encoder.convolutions='native'" in fault
+    assert "apt-get install gcc libc6-dev" in fault
+
+
+def test_a_broken_encoder_is_the_only_fault():
+    config = jaxil_config.default_config()
+    config.encoder.convolutions = "native"
+    config.encoder.channels = (32, "32", 32, 32)
+    (fault,) = assembly.problems(config)
+    assert "encoder.channels" in fault
+
+
+def test_an_unknown_form_is_a_fault():
+    config = jaxil_config.default_config()
+    config.encoder.convolutions = "cuda"
+    (fault,) = assembly.problems(config)
+    assert "auto, native, xla" in fault
