@@ -52,22 +52,25 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     config.replay_size_steps = 50_000
     config.replay_on_device = True  # on a CPU too: XLA stacks faster than NumPy
     config.exploration_std_steps = 50_000
-    config.discriminator.hidden_dim = 256
-    config.discriminator.batch_size = _DISCRIMINATOR_BATCHES.get(method, 64)
-    config.discriminator.learning_rate = 3e-4
-    config.discriminator.gradient_penalty = _GRADIENT_PENALTIES.get(
-        (method, task), config.discriminator.gradient_penalty
-    )
+    own = config.get("discriminator", {})
+    if "hidden_dim" in own:
+        own.hidden_dim = 256
+        own.gradient_penalty = _GRADIENT_PENALTIES.get((method, task), 10.0)
+    if own:
+        own.batch_size = _DISCRIMINATOR_BATCHES.get(method, 64)
+        own.learning_rate = 3e-4
+    transport = config.get("sinkhorn", {})
+    if transport:
+        transport.num_iterations = 50
+    if "target_update_steps" in transport:
+        transport.target_update_steps = 5_000 if config.action_repeat == 2 else 2_500
     config.reward_refresh_steps = 2_500
-    config.sinkhorn.target_update_steps = 5_000
-    config.sinkhorn.num_iterations = 50
     config.eval_every_frames = 10_000
     config.checkpoint_every_frames = 10_000
-    if method == "bc":
+    if "cloning" in config:
         config.cloning.batch_size = 64
     if config.action_repeat > 2:  # fewer decisions in as many frames
         config.exploration_steps = 500
         config.exploration_std_steps = 20_000
         config.replay_size_steps = 25_000
-        config.sinkhorn.target_update_steps = 2_500
     return config

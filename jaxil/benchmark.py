@@ -19,6 +19,7 @@ from typing import Any
 from absl import flags
 
 from jaxil import command
+from jaxil.errors import UsageError
 
 
 def main(argv: list[str]) -> None:
@@ -33,7 +34,7 @@ def main(argv: list[str]) -> None:
 
     faults = assembly.problems(values.config) + _flag_problems(values)
     if faults:
-        raise command.UsageError(command.listing(faults))
+        raise UsageError(faults)
     repeats, steps = values.repeats, values.steps
     if values.sweep is not None:
         sweep = sweeping.parse(values.sweep, values.config)
@@ -88,7 +89,7 @@ def _write(path: str | None, results: Any) -> None:
     try:
         write_atomically(path, (json.dumps(results, indent=2) + "\n").encode())
     except OSError as error:
-        raise command.UsageError(
+        raise UsageError(
             f"--json={path} can't be written ({error.strerror}); name a file in a "
             "folder of yours"
         ) from error

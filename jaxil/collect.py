@@ -24,6 +24,7 @@ from collections.abc import Iterator
 from absl import flags
 
 from jaxil import command
+from jaxil.errors import UsageError
 
 _NUM_EVAL_EPISODES = 10
 # The recording environment's seed: shared by no training and no evaluation.
@@ -54,7 +55,7 @@ def main(argv: list[str]) -> None:
     elif values.output is not None:
         faults += _output_faults(values)
     if faults:
-        raise command.UsageError(command.listing(faults))
+        raise UsageError(faults)
     from jaxil.machine import startup
 
     print(startup.prepare(), file=sys.stderr, flush=True)
@@ -72,7 +73,7 @@ def _record(values: flags.FlagValues) -> None:
     runs = [trained.load(pathlib.Path(folder)) for folder in values.workdirs]
     tasks = sorted({run.config.task for run in runs})
     if len(tasks) > 1:
-        raise command.UsageError(
+        raise UsageError(
             f"--workdirs hold runs of different tasks ({', '.join(tasks)}); give the "
             "seeds of one task"
         )
@@ -93,7 +94,7 @@ def _record(values: flags.FlagValues) -> None:
     try:
         states.write_states(values.output, stored)
     except (OSError, states.DemonstrationError) as error:
-        raise command.UsageError(f"--output={values.output}: {error}") from error
+        raise UsageError(f"--output={values.output}: {error}") from error
     returns = stored.rewards.sum(axis=1)
     size = pathlib.Path(values.output).stat().st_size / 1e6
     print(
@@ -126,7 +127,7 @@ def _inspect(values: flags.FlagValues) -> None:
         temporary.replace(sheet)
         write_video(video, seen.video, fps=seen.frames_per_second, labels=(name, ""))
     except OSError as error:
-        raise command.UsageError(f"--output={folder}: {error}") from error
+        raise UsageError(f"--output={folder}: {error}") from error
     # Last, so that `| head` cuts nothing short.
     print(inspection.table(seen))
     print(f"contact sheet: {sheet}\nvideo of episode 0: {video}")
@@ -168,11 +169,11 @@ def _told(path: pathlib.Path, flags_given: str) -> Iterator[None]:
     try:
         yield
     except DemonstrationError as error:
-        raise command.UsageError(str(error)) from error
+        raise UsageError(str(error)) from error
     except FormatError as error:
-        raise command.UsageError(f"{path} {error}.") from error
+        raise UsageError(f"{path} {error}.") from error
     except OSError as error:
-        raise command.UsageError(
+        raise UsageError(
             f"{flags_given} cannot be read or written ({error.strerror or error})"
         ) from error
 

@@ -3,22 +3,31 @@
 Exit status: 0 done; 2 wrong use, with one message that names every fault; 1 else.
 """
 
-import contextlib
+import ast
+import importlib.machinery
+import importlib.util
 import pathlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any
 
+import ml_collections
 from absl import flags
-from ml_collections import config_flags
 
 from jaxil import config as jaxil_config
+from jaxil import methods
+from jaxil.config import Config
+from jaxil.errors import Fault, UsageError, unknown_name
 
 Define = Callable[[flags.FlagValues], None]
 
-
-class UsageError(Exception):
-    """The user asked for what can't be done; the message says why and what to do."""
+_CONFIG = "config"
+_KINDS = {
+    bool: "True or False",
+    int: "a whole number",
+    float: "a number",
+    tuple: "a list in brackets, such as (32,32)",
+}
 
 
 def parse(argv: list[str], description: str, define: Define) -> flags.FlagValues:
@@ -27,65 +36,56 @@ def parse(argv: list[str], description: str, define: Define) -> flags.FlagValues
     Args:
       argv: as in `sys.argv`.
       description: what `--help` says first.
-      define: adds the command's flags.
+      define: adds the command's flags; see `define_config`.
 
     Raises:
       UsageError: names all flags and config fields that are wrong.
       SystemExit: status 0, after `--help`.
     """
+    values = flags.FlagValues()
+    define(values)
     if any(word in ("--help", "-h", "-help", "--helpfull") for word in argv[1:]):
-        values = flags.FlagValues()
-        define(values)
-        print(f"{description.strip()}\n\n{values.main_module_help()}{_help(values)}")
+        print(f"{description.strip()}\n\n{_help(values)}")
         raise SystemExit(0)
-    problems: list[str] = []
-    arguments = [word for word in argv if not _names_missing_file(word, problems)]
-    while True:
-        values = flags.FlagValues()
-        define(values)
-        try:
-            with _sys_argv(arguments):
-                rest = values(arguments)
-        except (flags.Error, AttributeError, KeyError, TypeError, ValueError) as error:
-            culprit = _culprit(arguments, error)
-            problems.append(_sentence(culprit, error, values))
-            if culprit is None:
-                break
-            # Without the faulty word, the next fault comes to light.
-            arguments.remove(culprit)
-            continue
-        except (OSError, SyntaxError, ImportError) as error:
-            problems.append(f"--config: the file can't be read: {error}")
-            break
-        problems += [
-            f"{word!r} is not a flag; flags start with --" for word in rest[1:]
-        ]
-        break
-    if "config" in values and not problems:
-        problems += _config_file_problems(values)
-    if problems:
-        # Faults of the config's values belong in the same message.
-        problems += _value_problems(values)
-        raise UsageError(listing(problems))
+    faults: list[Fault | str] = []
+    config_words = []
+    for word in _joined(argv[1:], values):
+        name = _name(word)
+        if not word.startswith("-"):
+            faults.append(Fault(repr(word), "is not a flag", "flags start with --"))
+        elif _CONFIG in values and name.split(".")[0] == _CONFIG:
+            config_words.append(word)
+        elif not {name, name.removeprefix("no")} & set(values):
+            known = tuple(f"--{flag}" for flag in values)
+            faults.append(unknown_name("flag", f"--{name}", known))
+        else:
+            try:
+                values([argv[0], word])
+            except flags.Error as error:
+                reason = str(error).split(": ", 1)[-1]
+                faults.append(Fault(f"--{name}", f"is wrong: {reason}"))
+    values.mark_as_parsed()
+    if _CONFIG in values:
+        config = _load(config_words, values[_CONFIG].default, faults)
+        values[_CONFIG].value = config
+        if faults and config is not None:
+            faults += _value_problems(config)  # in the same message
+    if faults:
+        raise UsageError(dict.fromkeys(faults))
     return values
 
 
-def _names_missing_file(word: str, problems: list[str]) -> bool:
-    """Says whether a word is `--config=FILE[:ARG]` without such a file."""
-    name, _, value = word.lstrip("-").partition("=")
-    path = pathlib.Path(value.split(":")[0])
-    if not word.startswith("-") or name != "config" or path.is_file():
-        return False
-    problems.append(
-        f"--config={value!r}: there is no file {str(path)!r} here; the presets are in "
-        "configs/, such as configs/pdac.py:walker_walk"
-    )
-    return True
+def read_config(words: Iterable[str]) -> Config:
+    """Returns the config of words such as "--config=FILE" and "--config.seed=3".
 
-
-def listing(faults: list[str]) -> str:
-    """Returns the message for a user, all faults together."""
-    return "This can't start:\n" + "\n".join(f"  - {fault}" for fault in faults)
+    Raises:
+      UsageError: as `parse` would.
+    """
+    faults: list[Fault | str] = []
+    config = _load(list(words), None, faults)
+    if faults:
+        raise UsageError(faults)
+    return config
 
 
 def run(main: Callable[[list[str]], int | None]) -> None:
@@ -110,114 +110,173 @@ def run(main: Callable[[list[str]], int | None]) -> None:
 
 def define_config(values: flags.FlagValues, default: str | None = None) -> None:
     """Adds `--config=FILE.py[:ARG]` and `--config.FIELD=VALUE`."""
-    config_flags.DEFINE_config_file(
-        "config",
+    flags.DEFINE_string(
+        _CONFIG,
         default,
         "configs/METHOD.py:TASK, or any file with get_config(); change a field with "
         "--config.FIELD=VALUE",
         flag_values=values,
-        lock_config=True,
     )
 
 
+def _name(word: str) -> str:
+    return word.lstrip("-").partition("=")[0]
+
+
+def _joined(words: list[str], values: flags.FlagValues) -> list[str]:
+    """Joins "--name value" to "--name=value"."""
+    joined: list[str] = []
+    rest = list(words)
+    while rest:
+        word = rest.pop(0)
+        name = _name(word)
+        is_switch = name in values and values[name].boolean
+        takes_value = name in values or name.startswith(f"{_CONFIG}.")
+        if word.startswith("-") and "=" not in word and takes_value and not is_switch:
+            word = f"{word}={rest.pop(0)}" if rest else word
+        joined.append(word)
+    return joined
+
+
 def _help(values: flags.FlagValues) -> str:
-    """Lists flags by name; absl groups them by module, and ours belong to none."""
+    """Lists flags by name, then the config's fields."""
     lines = []
     for name in sorted(values):
         flag = values[name]
         default = "" if flag.default is None else f" (default: {flag.default})"
         lines.append(f"  --{name}: {flag.help}{default}")
+    if _CONFIG not in values:
+        return "\n".join(lines)
+    lines.append("\nFields, each --config.FIELD=VALUE:")
+    lines += [_field_help(n, field) for n, field in jaxil_config.FIELDS.items()]
+    for name, method in methods.known().items():
+        for section, members in method.sections.items():
+            lines.append(f"\n  of {name} ({method.label}):")
+            lines += [_field_help(f"{section}.{n}", f) for n, f in members.items()]
     return "\n".join(lines)
 
 
-@contextlib.contextmanager
-def _sys_argv(arguments: list[str]) -> Iterator[None]:
-    # ml_collections looks for overrides in sys.argv, whatever it is asked to parse.
-    before, sys.argv = sys.argv, arguments
-    try:
-        yield
-    finally:
-        sys.argv = before
+def _field_help(name: str, field: methods.Field) -> str:
+    limits = ""
+    if field.choices:
+        limits = f"; one of {', '.join(field.choices)}"
+    elif field.low is not None:
+        limits = (
+            f"; {'above ' if field.positive else ''}{field.low:g} to {field.high:g}"
+        )
+    return f"  {name}: {field.about} (default: {field.default!r}{limits})"
 
 
-def _culprit(arguments: list[str], error: Exception) -> str | None:
-    """Returns the argument that an error is about."""
-    text = str(error)
-    for word in arguments[1:]:
-        name = word.lstrip("-").split("=")[0]
-        if isinstance(error, AttributeError | KeyError):
-            parts = name.split(".")
-            if parts[0] == "config" and _missing_field(error) in parts[1:]:
-                return word
-        elif name and (f"--{name}=" in text or f"'{name}'" in text):
-            return word
-    return None
-
-
-def _missing_field(error: Exception) -> str:
-    """Returns the field that ml_collections did not find, from its error."""
-    inner: Any = error
-    while isinstance(inner, Exception):  # one error may hold another
-        inner = inner.args[0] if inner.args else ""
-    # A second line may guess what was meant; the message has its own guess.
-    return str(inner).split("\n")[0].strip("'\"")
-
-
-def _sentence(culprit: str | None, error: Exception, values: flags.FlagValues) -> str:
-    if culprit is None:
-        return str(error)
-    name, _, value = culprit.lstrip("-").partition("=")
-    if isinstance(error, AttributeError | KeyError):
-        fields = tuple(_field_names(values))
-        return jaxil_config.unknown_name("field", name.removeprefix("config."), fields)
-    if isinstance(error, flags.UnrecognizedFlagError):
-        known = tuple(f"--{flag}" for flag in values)
-        return jaxil_config.unknown_name("flag", f"--{name}", known)
-    if name == "config":
-        reason = str(error).strip().splitlines()[-1]
-        return f"--config={value}: {reason}"
-    reason = str(error).split(": ", 1)[-1]
-    return f"{name.removeprefix('config.')}={value!r} has the wrong type: {reason}"
-
-
-def _field_names(values: flags.FlagValues) -> Iterator[str]:
-    config = _config_of(values) or jaxil_config.default_config()
-    for name, value in config.items():
-        if hasattr(value, "items"):
-            yield from (f"{name}.{inner}" for inner in value)
-        else:
-            yield name
-
-
-def _config_of(values: flags.FlagValues) -> Any:
-    """Returns the parsed config; None where there is none or it can't be loaded."""
-    if "config" not in values:
+def _load(
+    words: list[str], default: str | None, faults: list[Fault | str]
+) -> Config | None:
+    """Returns the config with its overrides, adding to `faults`; None without one."""
+    files = [word for word in words if _name(word) == _CONFIG]
+    value = files[-1].partition("=")[2] if files else default
+    if not value:
+        rule, way_out = "is missing", "give a file, such as configs/pdac_walker.py"
+        faults.append(Fault("--config", rule, way_out))
         return None
-    config = values["config"].value
+    overrides = {
+        _name(word).removeprefix(f"{_CONFIG}."): word.partition("=")[2]
+        for word in words
+        if word not in files
+    }
     try:
-        # ml_collections keeps a file's error until something of it is read.
-        return config if hasattr(config, "items") else None
-    except Exception:
+        config = _config_of_file(value)
+        if "method" in overrides:
+            _change_method(config, overrides["method"])
+    except UsageError as error:
+        faults.extend(error.faults)
         return None
+    for field, text in overrides.items():
+        faults.extend(_override(config, field, text))
+    return config.lock()
 
 
-def _config_file_problems(values: flags.FlagValues) -> list[str]:
-    config = values["config"].value
-    if config is None:
-        return ["--config is missing: give a file, such as configs/pdac_walker.py"]
+def _config_of_file(value: str) -> Config:
+    """Runs get_config of FILE.py[:ARGUMENT]."""
+    name, colon, argument = value.partition(":")
+    path = pathlib.Path(name).expanduser()
+    if not path.is_file():
+        raise UsageError(
+            Fault(
+                "--config",
+                f"names no file: there is no file {name!r} here",
+                "the presets are in configs/, such as configs/pdac.py:walker_walk",
+                value,
+            )
+        )
+    spec = importlib.util.spec_from_loader(
+        path.stem, importlib.machinery.SourceFileLoader(path.stem, str(path))
+    )
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
     try:
-        has_fields = hasattr(config, "items")
-    except Exception as error:  # whatever the user's file raised
-        return [f"--config: {str(error).strip().splitlines()[0]}"]
-    if has_fields:
-        return []
-    return ["--config: the file's get_config() must return a ConfigDict"]
+        spec.loader.exec_module(module)
+        config = module.get_config(*([argument] if colon else []))
+    except UsageError:
+        raise
+    except Exception as error:  # whatever the user's file raises
+        reason = (str(error).strip() or type(error).__name__).splitlines()[-1]
+        raise UsageError(
+            Fault("--config", f"cannot be loaded: {reason}", value=value)
+        ) from error
+    if not isinstance(config, ml_collections.ConfigDict):
+        rule = "has a get_config() that does not return a ConfigDict"
+        raise UsageError(Fault("--config", rule, value=value))
+    return config.unlock()
 
 
-def _value_problems(values: flags.FlagValues) -> list[str]:
-    config = _config_of(values)
-    if config is None:
-        return []
+def _change_method(config: Config, method: str) -> None:
+    """Gives a config another method, with the sections that it lacks."""
+    wanted = jaxil_config.default_config(method, config.task)
+    for section in methods.get(config.method).sections:
+        if section not in wanted:
+            del config[section]
+    for section, fields in methods.get(method).sections.items():
+        old = config.get(section, {})
+        config[section] = {
+            name: old.get(name, field.default) for name, field in fields.items()
+        }
+    if not methods.get(method).plays:
+        config.total_frames = wanted.total_frames
+    config.method = method
+
+
+def _override(config: Config, field: str, text: str) -> Iterable[Fault]:
+    """Sets a field from text, in the type that it has."""
+    known = tuple(jaxil_config.fields(config.method))
+    if field not in known:
+        return [unknown_name("field", field, known)]
+    group, _, leaf = field.rpartition(".")
+    target = config[group] if group else config
+    try:
+        target[leaf] = _parsed(text, target[leaf])
+    except (ValueError, SyntaxError):
+        expected = _KINDS[type(target[leaf])]
+        return [Fault(field, f"has the wrong type: expected {expected}", value=text)]
+    return []
+
+
+def _parsed(text: str, like: Any) -> Any:
+    if isinstance(like, str):
+        return text
+    if isinstance(like, bool):
+        names = {"true": True, "1": True, "false": False, "0": False}
+        if text.lower() not in names:
+            raise ValueError
+        return names[text.lower()]
+    if isinstance(like, tuple):
+        value = ast.literal_eval(text)
+        if not isinstance(value, tuple | list):
+            raise ValueError
+        return tuple(value)
+    return type(like)(text)
+
+
+def _value_problems(config: Config) -> list[Fault]:
     from jaxil.machine import startup
 
     startup.prepare()

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxil.errors import UsageError
 from jaxil.machine import startup
 
 _GL_INSTALL = f"apt-get install {' '.join(startup.GL_PACKAGES)}"
@@ -347,7 +348,7 @@ def _read_config(argv: list[str]) -> Any:
     config = jaxil_config.default_config() if given is None else given
     faults = jaxil_config.problems(config, suite.known_tasks())
     if faults:
-        raise command.UsageError(command.listing(faults))
+        raise UsageError(faults)
     return config
 
 

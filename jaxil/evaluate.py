@@ -12,6 +12,7 @@ import sys
 from absl import flags
 
 from jaxil import command
+from jaxil.errors import UsageError
 
 # Far from the episodes that training evaluates on.
 _FIRST_EPISODE = 1_000_000
@@ -21,7 +22,7 @@ def main(argv: list[str]) -> None:
     """Runs the command."""
     values = command.parse(argv, __doc__ or "", _define)
     if values.workdir is None:
-        raise command.UsageError(
+        raise UsageError(
             "--workdir is missing: name the folder of a run, such as --workdir=runs/1"
         )
     from jaxil.machine import startup

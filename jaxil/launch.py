@@ -13,13 +13,14 @@ import sys
 from absl import flags
 
 from jaxil import command
+from jaxil.errors import UsageError
 
 
 def main(argv: list[str]) -> int:
     """Runs the command; returns its exit status."""
     values = command.parse(argv, __doc__ or "", _define)
     if values.workdir is None:
-        raise command.UsageError(
+        raise UsageError(
             "--workdir is missing: name a folder for the run, such as --workdir=runs/1"
         )
     # Before jax and MuJoCo are imported, which the imports below do.
@@ -30,18 +31,19 @@ def main(argv: list[str]) -> int:
     from jaxil import train
     from jaxil.environments.pool import EnvironmentsFailed
     from jaxil.machine import provenance
+    from jaxil.training import agent as agents
     from jaxil.training import assembly, workdir
 
     config = values.config
     folder = pathlib.Path(values.workdir)
     faults = assembly.problems(config) + workdir.problems(folder, config)
     if faults:
-        raise command.UsageError(command.listing(faults))
+        raise UsageError(faults)
     print(provenance.memory_sentence(config), file=sys.stderr, flush=True)
     with workdir.opened(folder):
         try:
             gl_name = assembly.renderer_name(config)
-            native = assembly.uses_native_convolutions(config)
+            native = agents.uses_native_convolutions(config)
             description = provenance.describe(gl_name, native=native)
             workdir.write_config(folder, config, description)
             finished = train.train(config, folder)

@@ -14,6 +14,7 @@ import sys
 from absl import flags
 
 from jaxil import command
+from jaxil.errors import UsageError
 
 _MAX_SEEDS = 10_000
 
@@ -35,7 +36,7 @@ def main(argv: list[str]) -> None:
     else:
         faults += folder.problems(output)
     if faults:
-        raise command.UsageError(command.listing(faults))
+        raise UsageError(faults)
 
     from jaxil.reporting import assembly, runs
 
@@ -49,7 +50,7 @@ def main(argv: list[str]) -> None:
         names = ", ".join(map(str, roots))
         rule = f"no run can be read in or below {names}: a run is a folder that "
         rule += "`python -m jaxil.launch` has written, with a config.json"
-        raise command.UsageError(command.listing([*unreadable, rule]))
+        raise UsageError([*unreadable, rule])
     for sentence in unreadable:
         print(sentence, file=sys.stderr)
     print(f"{len(found)} runs; drawing", file=sys.stderr, flush=True)
@@ -62,7 +63,7 @@ def main(argv: list[str]) -> None:
             num_videos=values.videos,
         )
     except OSError as error:
-        raise command.UsageError(
+        raise UsageError(
             f"--output={str(output)!r} can't be written ({error.strerror or error}); "
             "name a folder of yours on a disk with room"
         ) from error

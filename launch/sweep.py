@@ -26,6 +26,7 @@ sys.path[0] = str(pathlib.Path(__file__).resolve().parent.parent)
 from absl import flags  # noqa: E402
 
 from jaxil import command  # noqa: E402
+from jaxil.errors import UsageError  # noqa: E402
 from jaxil.machine import startup  # noqa: E402
 from jaxil.reporting import figures  # noqa: E402
 from launch.sweeps import clusters, cost, faults, plan, slurm, state, tables  # noqa: E402
@@ -145,7 +146,7 @@ def _checked_runs(
         except faults.Faulty as error:
             sentences += error.sentences
     if sentences:
-        raise command.UsageError(command.listing(sentences))
+        raise UsageError(sentences)
     return runs
 
 

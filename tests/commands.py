@@ -16,11 +16,7 @@ SMALL = (
     "--config.hidden_dim=16",
     "--config.feature_dim=8",
     "--config.batch_size=8",
-    "--config.discriminator.batch_size=8",
-    "--config.discriminator.hidden_dim=16",
     "--config.demonstrations.num_episodes=2",
-    "--config.sinkhorn.target_update_steps=150",
-    "--config.sinkhorn.num_iterations=10",
     "--config.replay_size_steps=1000",
     "--config.exploration_steps=50",
     "--config.seed_frames=1000",
@@ -30,6 +26,16 @@ SMALL = (
     "--config.checkpoint_every_frames=2000",
     "--config.total_frames=4000",
 )
+
+
+# Fields of single methods, in small.
+_OWN = {
+    "pdac": ("discriminator.hidden_dim=16", "discriminator.batch_size=8"),
+    "dac": ("discriminator.hidden_dim=16", "discriminator.batch_size=8"),
+    "psil": ("sinkhorn.target_update_steps=150", "sinkhorn.num_iterations=10"),
+    "sil": ("discriminator.batch_size=8", "sinkhorn.num_iterations=10"),
+    "bc": ("cloning.batch_size=8",),
+}
 
 
 def arguments(module: str, *flags: str) -> list[str]:
@@ -56,4 +62,5 @@ def small_run(method: str, workdir: pathlib.Path) -> tuple[str, ...]:
         f"--config=configs/tiny.py:{method},ball_in_cup_catch",
         f"--workdir={workdir}",
         *SMALL,
+        *(f"--config.{word}" for word in _OWN.get(method, ())),
     )

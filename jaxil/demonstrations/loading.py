@@ -12,6 +12,7 @@ from jaxil.demonstrations import foreign, mismatch, rendering, states
 from jaxil.demonstrations.readers.recording import FormatError
 from jaxil.demonstrations.states import StateDemonstrations, fault, unreadable
 from jaxil.environments import suite
+from jaxil.maths.types import ExpertBatch
 from jaxil.replay.stacking import gather_stacks
 
 _WAY_OUT = (
@@ -202,8 +203,9 @@ def sample(
     batch_size: int,
     *,
     frame_stack: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draws expert observations with the actions taken there, uniformly.
+    successors: bool = False,
+) -> ExpertBatch:
+    """Samples expert observations with the actions taken there, uniformly.
 
     Args:
       demonstrations: whole episodes of single frames.
@@ -211,17 +213,26 @@ def sample(
       batch_size: B.
       frame_stack: frames in an observation; an episode's first frame stands in for
         those before it.
+      successors: whether to add the observations one step later.
 
     Returns:
       Observations uint8 [B, H, W, 3 * frame_stack] or float32 [B, S], and actions
       [B, A]; A is 0 where the demonstrations have none.
     """
-    indices, actions = sample_indices(
-        demonstrations, rng, batch_size, frame_stack=frame_stack
+    found = sample_indices(
+        demonstrations,
+        rng,
+        batch_size,
+        frame_stack=frame_stack,
+        successors=successors,
     )
     # As one long row of frames, without a copy, from which stacks are gathered.
     frames = demonstrations.frames.reshape(-1, *demonstrations.frames.shape[2:])
-    return gather_stacks(frames, indices), actions
+    successor = found.successor
+    return found._replace(
+        observation=gather_stacks(frames, found.observation),
+        successor=None if successor is None else gather_stacks(frames, successor),
+    )
 
 
 def sample_indices(
@@ -230,30 +241,33 @@ def sample_indices(
     batch_size: int,
     *,
     frame_stack: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draws what `sample` draws, with the places of frames instead of pixels.
-
-    Args:
-      demonstrations: see `sample`, as all others.
+    successors: bool = False,
+) -> ExpertBatch:
+    """Samples what `sample` does, with the indices of frames instead of pixels.
 
     Returns:
-      int32 [B, frame_stack], the frames of each stack, the oldest first, as places in
-      the frames of all episodes laid end to end, [K * (N + 1), ...]; actions [B, A].
+      Observations int32 [B, frame_stack]: indices, the oldest first, into the frames of
+      all episodes laid end to end, [K * (N + 1), ...].
     """
     num_steps = demonstrations.num_frames - 1  # no action follows the last frame
     ends = np.cumsum(num_steps)
-    drawn = rng.integers(ends[-1], size=batch_size)
-    episodes = np.searchsorted(ends, drawn, side="right")
-    steps = drawn - (ends - num_steps)[episodes]
-    ages = np.arange(frame_stack - 1, -1, -1)
-    times = np.maximum(steps[:, None] - ages, 0)
-    indices = episodes[:, None] * demonstrations.frames.shape[1] + times
+    chosen = rng.integers(ends[-1], size=batch_size)
+    episodes = np.searchsorted(ends, chosen, side="right")
+    steps = chosen - (ends - num_steps)[episodes]
+
+    def stacks(times: np.ndarray) -> np.ndarray:
+        ages = np.arange(frame_stack - 1, -1, -1)
+        inside = np.maximum(times[:, None] - ages, 0)
+        first = episodes[:, None] * demonstrations.frames.shape[1]
+        return (first + inside).astype(np.int32)
+
     actions = (
         np.zeros((batch_size, 0), np.float32)
         if demonstrations.actions is None
         else demonstrations.actions[episodes, steps]
     )
-    return indices.astype(np.int32), actions
+    successor = stacks(steps + 1) if successors else None
+    return ExpertBatch(stacks(steps), actions, successor)
 
 
 def _path_of(source: str | os.PathLike, task: str) -> pathlib.Path:

@@ -7,10 +7,10 @@ import numpy as np
 from jaxil.environments.interaction import (
     Act,
     Decision,
-    FinishedEpisode,
     interact,
     join,
 )
+from jaxil.maths.types import Episode
 
 
 class Evaluation(NamedTuple):
@@ -22,7 +22,7 @@ class Evaluation(NamedTuple):
       video: images of the first episode, uint8 [T + 1, H, W, 3]; None if not asked.
     """
 
-    episodes: list[FinishedEpisode]
+    episodes: list[Episode]
     task_returns: np.ndarray
     video: np.ndarray | None
 
@@ -54,7 +54,7 @@ def evaluate(
       first_episode: number of the first, which fixes how each one starts.
       record_video: whether to keep the first episode's images.
     """
-    episodes: list[FinishedEpisode] = []
+    episodes: list[Episode] = []
     returns: list[float] = []
     played: list[Decision] = []
     images: list[np.ndarray] = []

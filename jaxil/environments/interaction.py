@@ -1,13 +1,13 @@
 """The agent and its environment, one decision at a time, or one of each of several."""
 
-import dataclasses
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from jaxil.maths.types import Episode
+
 Act = Callable[[np.ndarray], np.ndarray]  # observation -> action [A]
-ActTogether = Callable[[np.ndarray], np.ndarray]  # observations [E, ...] -> [E, A]
 
 
 class Decision(NamedTuple):
@@ -108,112 +108,12 @@ class Environments(Protocol):
         """Waits for the outcome; None if it was lost, and the episode with it."""
         ...
 
-
-@dataclasses.dataclass
-class _Seat:
-    """Where an episode is played: what it shows, and at its start the first frame."""
-
-    episode: int
-    moment: Moment | None = None
-    first_frame: np.ndarray | None = None
+    def close(self) -> None:
+        """Ends their processes."""
+        ...
 
 
-def interact_together(
-    environments: Environments,
-    act: ActTogether,
-    *,
-    first_episode: int,
-    begin: Callable[[int], bool],
-    meanwhile: Callable[[], None] = lambda: None,
-) -> Iterator[list[Decision]]:
-    """Yields rounds without end: one decision of each environment that plays.
-
-    Each episode is one that `interact` could have played. A free environment is given
-    the lowest number that is left; an episode that was lost is played again from its
-    start. Rounds are sorted by the episodes' numbers, and empty if nothing plays.
-
-    Args:
-      environments: at least one.
-      act: the policy; its rows are sorted as the round is.
-      first_episode: number of the first episode.
-      begin: asked before each episode, whether it is to be played.
-      meanwhile: called once for each decision, between the sending of the actions and
-        the waiting for what comes of them.
-    """
-    next_episode, lost = first_episode, []
-    seats: dict[int, _Seat] = {}  # by place
-
-    def receive(place: int) -> Moment | None:
-        moment = environments.receive(place)
-        if moment is None:
-            lost.append(seats.pop(place).episode)
-        return moment
-
-    while True:
-        free = [place for place in range(environments.size) if place not in seats]
-        for place in free:
-            episode = min(lost, default=next_episode)
-            if not begin(episode):
-                break
-            if lost:
-                lost.remove(episode)
-            else:
-                next_episode += 1
-            environments.reset(place, episode)
-            seats[place] = _Seat(episode)
-        for place in [place for place in free if place in seats]:
-            if (moment := receive(place)) is not None:
-                seats[place].moment, seats[place].first_frame = moment, moment.frame
-
-        places = sorted(seats, key=lambda place: seats[place].episode)
-        moments = [seats[place].moment for place in places]
-        actions = np.zeros((0, 0), np.float32)
-        if places:
-            seen = np.stack([moment.observation for moment in moments if moment])
-            actions = np.asarray(act(seen), np.float32)
-        for place, action in zip(places, actions, strict=True):
-            environments.step(place, action)
-        for _ in places:
-            meanwhile()
-        decisions = []
-        for place, action in zip(places, actions, strict=True):
-            seat = seats[place]
-            if (moment := receive(place)) is None:
-                continue
-            decisions.append(
-                Decision(
-                    frame=moment.frame,
-                    first_frame=seat.first_frame,
-                    action=action,
-                    task_reward=moment.task_reward,
-                    discount=moment.discount,
-                    is_last=moment.is_last,
-                    episode=seat.episode,
-                )
-            )
-            seat.moment, seat.first_frame = moment, None
-            if moment.is_last:
-                del seats[place]
-        yield decisions
-
-
-class FinishedEpisode(NamedTuple):
-    """One whole episode, as the replay takes it.
-
-    Attributes:
-      frames: uint8 [T + 1, H, W, 3], or float32 [T + 1, S].
-      actions: float32 [T, A].
-      task_rewards: float32 [T].
-      discounts: float32 [T].
-    """
-
-    frames: np.ndarray
-    actions: np.ndarray
-    task_rewards: np.ndarray
-    discounts: np.ndarray
-
-
-def join(decisions: list[Decision]) -> FinishedEpisode:
+def join(decisions: list[Decision]) -> Episode:
     """Returns the episode that `decisions` make up.
 
     Args:
@@ -228,9 +128,9 @@ def join(decisions: list[Decision]) -> FinishedEpisode:
             f"episode {first.episode} is not whole: an episode runs from its reset to "
             "its last decision"
         )
-    return FinishedEpisode(
+    return Episode(
         frames=np.stack([first.first_frame, *(d.frame for d in decisions)]),
         actions=np.stack([d.action for d in decisions]),
-        task_rewards=np.asarray([d.task_reward for d in decisions], np.float32),
+        rewards=np.asarray([d.task_reward for d in decisions], np.float32),
         discounts=np.asarray([d.discount for d in decisions], np.float32),
     )

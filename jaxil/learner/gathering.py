@@ -59,9 +59,13 @@ def gather_batch(frames: Data, batch: Batch) -> Batch:
     window = batch.window
     if window is not None:
         window = window._replace(observation=gather_stacks(frames, window.observation))
+    successor = batch.successor
+    if successor is not None:
+        successor = gather_stacks(frames, successor)
     return batch._replace(
         observation=gather_stacks(frames, batch.observation),
         next_observation=gather_stacks(frames, batch.next_observation),
+        successor=successor,
         window=window,
     )
 
@@ -75,7 +79,12 @@ def gather_expert(frames: Data, expert: ExpertBatch) -> ExpertBatch:
     """
     chex.assert_rank(frames, {3, 5})
     row = jnp.asarray(frames).reshape(-1, *frames.shape[2:])
-    return expert._replace(observation=gather_stacks(row, expert.observation))
+    successor = expert.successor
+    if successor is not None:
+        successor = gather_stacks(row, successor)
+    return expert._replace(
+        observation=gather_stacks(row, expert.observation), successor=successor
+    )
 
 
 def make_gathering_step(step: Step) -> Step:

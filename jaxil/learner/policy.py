@@ -1,7 +1,8 @@
-"""From one observation to one action."""
+"""From observations to actions."""
 
 from collections.abc import Callable
 
+import chex
 import jax
 import jax.numpy as jnp
 import optax
@@ -11,64 +12,51 @@ from jaxil.maths import distributions
 from jaxil.maths.types import Data, Params
 from jaxil.networks.agent import AgentNetworks, apply
 
-Explore = Callable[[Params, Params, Data, Array, Data], Array]
-ExploreTogether = Callable[[Params, Params, Data, Array, Data], Array]
-Exploit = Callable[[Params, Params, Data], Array]
+SampleAction = Callable[[Params, Params, Data, Array, Data], Array]
+MeanAction = Callable[[Params, Params, Data], Array]
 
 
-def make_explore(networks: AgentNetworks, exploration_std: optax.Schedule) -> Explore:
+def make_sample_action(
+    networks: AgentNetworks, exploration_std: optax.Schedule
+) -> SampleAction:
     """Returns the policy that gathers experience.
 
-    (encoder params, actor params, observation [H, W, C], key, num_steps) -> action
-    [A], where `num_steps` counts agent steps: it sets the noise's size and, with the
-    run's base key, its draw. The noise is not clipped here: that is for updates.
-
-    Args:
-      networks: the agent's.
-      exploration_std: standard deviation by agent step.
-    """
-    exploit = make_exploit(networks)
-
-    def explore(
-        encoder: Params, actor: Params, observation: Data, key: Array, num_steps: Data
-    ) -> Array:
-        mean = exploit(encoder, actor, observation)
-        std = jnp.asarray(exploration_std(num_steps), mean.dtype)
-        step_key = jax.random.fold_in(key, num_steps)
-        return distributions.sample_truncated_normal(
-            mean, std, step_key, noise_clip=None
-        )
-
-    return explore
-
-
-def make_explore_together(
-    networks: AgentNetworks, exploration_std: optax.Schedule
-) -> ExploreTogether:
-    """Returns the policy that gathers experience in several environments at once.
-
     (encoder params, actor params, observations [E, H, W, C], key, num_steps [E]) ->
-    actions [E, A]: those of `make_explore`, each with the noise of its own agent step.
+    actions [E, A]. `num_steps` counts agent steps: it sets the noise's size and, with
+    the run's base key, its draw. Noise is clipped in updates only, not here.
 
     Args:
       networks: the agent's.
       exploration_std: standard deviation by agent step.
     """
-    explore = make_explore(networks, exploration_std)
-    return jax.vmap(explore, in_axes=(None, None, 0, None, 0))
+    mean_action = make_mean_action(networks)
+
+    def sample_action(
+        encoder: Params, actor: Params, observations: Data, key: Array, num_steps: Data
+    ) -> Array:
+        chex.assert_equal_shape_prefix([observations, num_steps], 1)
+
+        def noisy(mean: Array, step: Array) -> Array:
+            std = jnp.asarray(exploration_std(step), mean.dtype)
+            step_key = jax.random.fold_in(key, step)
+            return distributions.sample_truncated_normal(
+                mean, std, step_key, noise_clip=None
+            )
+
+        means = mean_action(encoder, actor, observations)
+        return jax.vmap(noisy)(means, jnp.asarray(num_steps))
+
+    return sample_action
 
 
-def make_exploit(networks: AgentNetworks) -> Exploit:
-    """Returns the policy that is evaluated: the mean action, no noise.
+def make_mean_action(networks: AgentNetworks) -> MeanAction:
+    """Returns the policy that is evaluated, without noise.
 
-    (encoder params, actor params, observation [H, W, C]) -> action [A].
-
-    Args:
-      networks: the agent's.
+    (encoder params, actor params, observations [E, H, W, C]) -> actions [E, A].
     """
 
-    def exploit(encoder: Params, actor: Params, observation: Data) -> Array:
-        representation = apply(networks.encoder, encoder, observation[None])
-        return jnp.tanh(apply(networks.actor, actor, representation))[0]
+    def mean_action(encoder: Params, actor: Params, observations: Data) -> Array:
+        representation = apply(networks.encoder, encoder, observations)
+        return jnp.tanh(apply(networks.actor, actor, representation))
 
-    return exploit
+    return mean_action

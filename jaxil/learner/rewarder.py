@@ -3,28 +3,60 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import chex
+import jax
+import jax.numpy as jnp
 from jax import Array
 
 from jaxil.learner.state import LearnerParams
-from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes, Metrics, Window
+from jaxil.maths.types import (
+    Batch,
+    Data,
+    Episode,
+    ExpertBatch,
+    ExpertEpisodes,
+    Metrics,
+)
+from jaxil.networks.agent import AgentNetworks
 
 RewarderState = Any  # a pytree, the method's own
 
 
+class AgentSpec(NamedTuple):
+    """What a method may know of the agent when it is made.
+
+    Attributes:
+      networks: the agent's.
+      feature_dim: D.
+      frame_stack: frames in an observation.
+      shift_padding: of the random shift, in pixels; 0 for no augmentation.
+    """
+
+    networks: AgentNetworks
+    feature_dim: int
+    frame_stack: int
+    shift_padding: int
+
+
 class AgentView(NamedTuple):
-    """What the agent's update has computed anyway, before it steps.
+    """The agent's samples, as its own update has computed them before it steps.
 
     Attributes:
       observation: augmented pixels. Shape [B, H, W, C].
       features: critic trunk features of them, without gradient. Shape [B, D].
       action: shape [B, A].
       unshifted: the pixels as they were stored. Shape [B, H, W, C].
+      successor: the observations one step later, augmented, like `observation`, and
+      successor_features: their features, like `features`; both None unless the method
+        has `samples_successors`.
     """
 
     observation: Array
     features: Array
     action: Array
     unshifted: Array
+    successor: Array | None = None
+    successor_features: Array | None = None
 
 
 class Spec(NamedTuple):
@@ -34,7 +66,7 @@ class Spec(NamedTuple):
       action_dim: A.
       feature_dim: D.
       num_demonstrations: K; 0 without demonstrations.
-      expert_steps: N, decisions in a demonstration.
+      expert_steps: N, agent steps in a demonstration.
       observation_shape: (H, W, C), or (S,).
     """
 
@@ -45,58 +77,125 @@ class Spec(NamedTuple):
     observation_shape: tuple[int, ...]
 
 
-class Rewarder(NamedTuple):
-    """An imitation method, as (init, update) is an optimiser in optax.
-
-    Attributes:
-      init: (key, spec, learner) -> state. What the method learns or remembers;
-        `learner` is there for methods that start as a copy of live networks.
-      update: (state, learner, agent, expert, key) -> (state, metrics). Traced
-        inside the learner's update step, on parameters from before that step.
-        Methods that do not learn return the state as it is.
-      rewards: (state, learner, episode, expert_episodes) -> (rewards [T], state).
-        Called once for each episode, at its end; reward t belongs to the
-        transition from observation t to observation t + 1.
-      samples_expert: whether `update` reads an expert batch; without, none is
-        drawn and `expert` is None.
-      matches_episodes: whether `rewards` reads whole demonstrations; without,
-        `expert_episodes` is None.
-      summary: state -> scalars worth logging after an episode.
-      relabel: (state, learner, window) -> rewards [B, n]. For methods that reward
-        sampled transitions anew at each update; None where rewards are stored.
-      rewards_changed: state -> whether an episode rewarded before the last call of
-        `rewards` would get other rewards now: a bool or a bool array. None where
-        rewards never change, or are not read because `relabel` replaces them.
-      plan: (state, learner, episode, expert_episodes) -> the transport plan
-        [T + 1, N + 1] behind `rewards`, for people to look at; None without one.
-    """
-
-    init: Callable[[Array, Spec, LearnerParams], RewarderState]
-    update: Callable[
-        [RewarderState, LearnerParams, AgentView, ExpertBatch | None, Array],
-        tuple[RewarderState, Metrics],
-    ]
-    rewards: Callable[
-        [RewarderState, LearnerParams, Episode, ExpertEpisodes | None],
-        tuple[Array, RewarderState],
-    ]
-    samples_expert: bool
-    matches_episodes: bool
-    summary: Callable[[RewarderState], Metrics] = lambda state: {}
-    relabel: Callable[[RewarderState, LearnerParams, Window], Array] | None = None
-    rewards_changed: Callable[[RewarderState], Array | bool] | None = None
-    plan: (
-        Callable[[RewarderState, LearnerParams, Episode, ExpertEpisodes], Array] | None
-    ) = None
+def _no_state(key: Array, spec: Spec, learner: LearnerParams) -> RewarderState:
+    del key, spec, learner
+    return ()
 
 
-def keep_state(
+def _keep(
     state: RewarderState,
     learner: LearnerParams,
     agent: AgentView,
     expert: ExpertBatch | None,
     key: Array,
 ) -> tuple[RewarderState, Metrics]:
-    """The `update` of a method that does not learn by gradients."""
     del learner, agent, expert, key
     return state, {}
+
+
+def _ignore_episode(
+    state: RewarderState,
+    learner: LearnerParams,
+    episode: Episode,
+    expert_episodes: ExpertEpisodes | None,
+) -> RewarderState:
+    del learner, episode, expert_episodes
+    return state
+
+
+class Rewarder(NamedTuple):
+    """An imitation method, as (init, update) is an optimiser in optax.
+
+    Attributes:
+      rewards: (state, learner, episode, expert_episodes) -> rewards [T]; reward t
+        belongs to the transition from observation t to observation t + 1.
+      init: (key, spec, learner) -> state: what the method learns or remembers;
+        `learner` is for methods that start as a copy of live networks.
+      update: (state, learner, agent, expert, key) -> (state, metrics). Traced inside
+        the learner's update step, on parameters from before that step.
+      observe: (state, learner, episode, expert_episodes) -> state. Called once for
+        each episode, at its end and before it is rewarded.
+      expert_batch_size: expert samples that `update` gets; 0: `expert` is None.
+      matches_episodes: whether `observe` and `rewards` read whole demonstrations;
+        without, `expert_episodes` is None.
+      samples_successors: whether samples of agent and expert come with the
+        observation one step later.
+      relabel: (state, learner, batch) -> rewards [B, n], for methods that reward each
+        batch by the current state; `batch` has its window. None where rewards are
+        stored.
+      rewards_changed: state -> whether an episode rewarded before the last `observe`
+        would get other rewards now. None where stored rewards never change.
+      actor_loss: (state, learner, agent, expert, key) -> scalar, added to the actor's
+        loss; `learner.actor` is what it is differentiated for. None without.
+      plan: (state, learner, episode, expert_episodes) -> the transport plan
+        [T + 1, N + 1] behind `rewards`, to look at; None without one.
+      summary: state -> scalars worth logging after an episode.
+    """
+
+    rewards: Callable[
+        [RewarderState, LearnerParams, Episode, ExpertEpisodes | None], Array
+    ]
+    init: Callable[[Array, Spec, LearnerParams], RewarderState] = _no_state
+    update: Callable[
+        [RewarderState, LearnerParams, AgentView, ExpertBatch | None, Array],
+        tuple[RewarderState, Metrics],
+    ] = _keep
+    observe: Callable[
+        [RewarderState, LearnerParams, Episode, ExpertEpisodes | None], RewarderState
+    ] = _ignore_episode
+    expert_batch_size: int = 0
+    matches_episodes: bool = False
+    samples_successors: bool = False
+    relabel: Callable[[RewarderState, LearnerParams, Batch], Array] | None = None
+    rewards_changed: Callable[[RewarderState], Array | bool] | None = None
+    actor_loss: (
+        Callable[
+            [RewarderState, LearnerParams, AgentView, ExpertBatch | None, Array], Array
+        ]
+        | None
+    ) = None
+    plan: (
+        Callable[[RewarderState, LearnerParams, Episode, ExpertEpisodes], Array] | None
+    ) = None
+    summary: Callable[[RewarderState], Metrics] = lambda state: {}
+
+
+def make_refresh(rewarder: Rewarder) -> Callable[..., Array]:
+    """Returns the function that recomputes the rewards of stored episodes.
+
+        (rewarder state, learner, frames [M, ...], indices [E, T + 1],
+         actions [E, T, A], expert episodes) -> rewards [E, T]
+
+    Each row is what `rewarder.rewards` returns for that episode now. `indices` say
+    where each episode's frames are in `frames`; all episodes have one length.
+
+    Args:
+      rewarder: its rewards must follow from frames and actions alone: task rewards
+        are not stored.
+    """
+
+    def refresh(
+        state: RewarderState,
+        learner: LearnerParams,
+        frames: Data,
+        indices: Data,
+        actions: Data,
+        expert_episodes: ExpertEpisodes | None,
+    ) -> Array:
+        chex.assert_rank([frames, indices, actions], [{2, 4}, 2, 3])
+        chex.assert_equal_shape_prefix([indices, actions], 1)
+        num_steps = actions.shape[1]
+        chex.assert_axis_dimension(indices, 1, num_steps + 1)
+        frames = jnp.asarray(frames)
+        unknown = jnp.full(num_steps, jnp.nan)
+
+        def episode_rewards(stored: tuple[Array, Array]) -> Array:
+            frame_indices, taken = stored
+            episode = Episode(frames[frame_indices], taken, unknown, unknown)
+            return rewarder.rewards(state, learner, episode, expert_episodes)
+
+        # One at a time: a batch of episodes would need gigabytes.
+        stored = (jnp.asarray(indices), jnp.asarray(actions))
+        return jax.lax.map(episode_rewards, stored)
+
+    return refresh

@@ -19,7 +19,7 @@ from jaxil.learner.state import (
 )
 from jaxil.maths import augmentation, distributions, losses
 from jaxil.maths.types import Batch, Data, ExpertBatch, Metrics, Params
-from jaxil.networks.agent import AgentNetworks, apply
+from jaxil.networks.agent import AgentNetworks, apply, critic_features
 
 UpdateStep = Callable[
     [TrainState, Batch, ExpertBatch | None], tuple[TrainState, Metrics]
@@ -114,7 +114,7 @@ def make_update_step(learner: Learner) -> UpdateStep:
         unshifted = batch.observation
         if learner.rewarder.relabel is not None:
             assert batch.window is not None
-            rewards = learner.rewarder.relabel(state.rewarder, before, batch.window)
+            rewards = learner.rewarder.relabel(state.rewarder, before, batch)
             chex.assert_equal_shape([rewards, batch.window.weight])
             reward = jnp.sum(batch.window.weight * rewards, axis=1)
             batch = batch._replace(reward=jax.lax.stop_gradient(reward))
@@ -126,12 +126,14 @@ def make_update_step(learner: Learner) -> UpdateStep:
         state, representation, features, critic_metrics = _update_critic(
             learner, state, batch, std, target_key
         )
+        agent = AgentView(batch.observation, features, batch.action, unshifted)
+        if learner.rewarder.samples_successors:
+            agent = _with_successors(learner, before, batch, agent, rewarder_key)
         state, actor_metrics = _update_actor(
-            learner, state, representation, std, actor_key
+            learner, state, representation, std, actor_key, agent, expert
         )
         # The rewarder's step is written last but reads only values from before
         # this update, as if it came first; so the features are computed once.
-        agent = AgentView(batch.observation, features, batch.action, unshifted)
         rewarder, rewarder_metrics = learner.rewarder.update(
             state.rewarder, before, agent, expert, rewarder_key
         )
@@ -150,6 +152,21 @@ def make_update_step(learner: Learner) -> UpdateStep:
         }
 
     return update_step
+
+
+def _with_successors(
+    learner: Learner, before: LearnerParams, batch: Batch, agent: AgentView, key: Array
+) -> AgentView:
+    """Adds augmented successors, and their features without gradient."""
+    assert batch.successor is not None
+    # A draw of its own, so that methods without successors keep theirs.
+    successor = _augment(learner, batch.successor, jax.random.fold_in(key, 1))
+    features = critic_features(
+        learner.networks, before.encoder, before.critic, successor
+    )
+    return agent._replace(
+        successor=successor, successor_features=jax.lax.stop_gradient(features)
+    )
 
 
 def _augment(learner: Learner, observation: Array, key: Array) -> Array:
@@ -203,9 +220,15 @@ def _update_critic(
 
 
 def _update_actor(
-    learner: Learner, state: TrainState, representation: Array, std: Array, key: Array
+    learner: Learner,
+    state: TrainState,
+    representation: Array,
+    std: Array,
+    key: Array,
+    agent: AgentView,
+    expert: ExpertBatch | None,
 ) -> tuple[TrainState, Metrics]:
-    """Steps the actor against the updated critic."""
+    """Steps the actor against the updated critic, and the method's own term."""
     _, actor, critic = learner.networks
 
     def loss(params: Params) -> tuple[Array, Array]:
@@ -215,7 +238,16 @@ def _update_actor(
         )
         values = apply(critic, state.critic.params, representation, action)
         penalty = losses.saturation_penalty(pre_tanh)
-        return losses.actor_loss(values) + learner.pre_tanh_penalty * penalty, pre_tanh
+        total = losses.actor_loss(values) + learner.pre_tanh_penalty * penalty
+        if learner.rewarder.actor_loss is not None:
+            total += learner.rewarder.actor_loss(
+                state.rewarder,
+                state.params._replace(actor=params),
+                agent,
+                expert,
+                jax.random.fold_in(key, 1),
+            )
+        return total, pre_tanh
 
     (value, pre_tanh), gradients = jax.value_and_grad(loss, has_aux=True)(
         state.actor.params

@@ -1,26 +1,26 @@
-"""Names for the values that travel between the floors.
+"""Names for the values that travel between the rooms; NumPy's and jax's alike.
 
 Axes, everywhere in this project: B batch, T agent time, N expert time,
 K demonstrations, H W C pixels (channels last, the stack folded into C),
-S state vector, R representation, D feature, A action.
+S state vector, R representation, D feature, A action, n steps of a window.
 """
 
 from typing import Any, NamedTuple
 
-from jax import Array
-
 Params = Any  # a pytree of arrays, as flax makes it
 Data = Any  # an array: NumPy's on the host, jax's inside jitted functions
-Metrics = dict[str, Array]  # scalars, left on the device until they are logged
+Metrics = dict[str, Any]  # scalars, left on the device until they are logged
 
 
 class Window(NamedTuple):
-    """Every transition of n-step windows, for methods that reward them anew.
+    """All transitions of n-step windows, for methods that relabel samples.
+
+    The observation after the last one is the batch's `next_observation`.
 
     Attributes:
       observation: uint8 [B, n, H, W, C], or float32 [B, n, S].
       action: shape [B, n, A].
-      weight: what each one's reward counts for in the window's: gamma^k times the
+      weight: factor of each reward in the window's return: gamma^k times the
         environment's discounts before it. Shape [B, n].
     """
 
@@ -30,16 +30,19 @@ class Window(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Sampled transitions, n environment decisions long.
+    """Sampled transitions of n agent steps.
+
+    Where frames are on the device, observations are the indices of their frames
+    instead: int32 [B, F], the oldest first.
 
     Attributes:
-      observation: uint8 [B, H, W, C], or float32 [B, S] for state vectors.
-      action: first action of each window, in [-1, 1]. Shape [B, A].
-      reward: discounted sum of the window's rewards. Shape [B].
-      discount: product of environment discounts and gamma^n. Shape [B].
-      next_observation: observation after the window, like `observation`.
-      window: all of the window's transitions; None for methods whose rewards are
-        stored.
+      observation: o_t, uint8 [B, H, W, C], or float32 [B, S] for state vectors.
+      action: a_t, in [-1, 1]. Shape [B, A].
+      reward: discounted sum of r_t ... r_{t+n-1}. Shape [B].
+      discount: gamma^n times the environment's discounts. Shape [B].
+      next_observation: o_{t+n}, like `observation`.
+      successor: o_{t+1}, like `observation`; None unless the method asks for it.
+      window: all transitions; None unless the method relabels.
     """
 
     observation: Data
@@ -47,6 +50,7 @@ class Batch(NamedTuple):
     reward: Data
     discount: Data
     next_observation: Data
+    successor: Data | None = None
     window: Window | None = None
 
 
@@ -55,27 +59,32 @@ class ExpertBatch(NamedTuple):
 
     Attributes:
       observation: uint8 [B, H, W, C], or float32 [B, S].
-      action: what the expert did there. Shape [B, A]. Read only by methods that
-        say that they see actions.
+      action: what the expert did there. Shape [B, A]; zeros where unknown. Read only
+        by methods that declare that they see actions.
+      successor: the next observation; None unless the method asks for it.
     """
 
     observation: Data
     action: Data
+    successor: Data | None = None
 
 
 class Episode(NamedTuple):
-    """One finished episode of the agent, frames not stacked.
+    """One finished episode, frames not stacked.
 
     Attributes:
       frames: uint8 [T + 1, H, W, 3], or float32 [T + 1, S]; the first one is the
         observation at reset.
       actions: shape [T, A].
-      task_rewards: the environment's own rewards. Shape [T].
+      rewards: rewards[t] belongs to the transition from o_t to o_{t+1}: the task's
+        where the environment ends, the method's in the replay. Shape [T].
+      discounts: the environment's: 0 after a true end, 1 at a time limit. Shape [T].
     """
 
     frames: Data
     actions: Data
-    task_rewards: Data
+    rewards: Data
+    discounts: Data
 
 
 class ExpertEpisodes(NamedTuple):

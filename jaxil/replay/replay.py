@@ -8,35 +8,13 @@ Axes: B batch, T steps of an episode, n the length of a window, H W C pixels.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
+from jaxil.maths.types import Batch, Window
 from jaxil.replay.episode import require
 from jaxil.replay.ring import EpisodeRing, ring_slots
 from jaxil.replay.stacking import gather_stacks
-
-
-class Window(NamedTuple):
-    """All transitions of n-step windows, for methods that reward them anew."""
-
-    observation: np.ndarray  # [B, n, H, W, C * stack] uint8, or [B, n, S] float32
-    action: np.ndarray  # [B, n, A] float32
-    weight: np.ndarray  # [B, n] float32: what each reward is multiplied by in the sum
-
-
-class Batch(NamedTuple):
-    """Transitions over n steps, as the learner gets them.
-
-    From `sample_indices`, with slots of frames in the place of pixels.
-    """
-
-    observation: np.ndarray  # [B, H, W, C * stack] uint8, or [B, S] float32: o_t
-    action: np.ndarray  # [B, A] float32: a_t
-    reward: np.ndarray  # [B] float32: discounted sum of r_t ... r_{t+n-1}
-    discount: np.ndarray  # [B] float32: what the value of o_{t+n} is multiplied by
-    next_observation: np.ndarray  # like observation: o_{t+n}
-    window: Window | None  # None unless asked for
 
 
 def memory_bytes(
@@ -129,7 +107,12 @@ class Replay(EpisodeRing):
         return bool(self._num_windows().any())
 
     def sample(
-        self, rng: np.random.Generator, batch_size: int, *, windows: bool = False
+        self,
+        rng: np.random.Generator,
+        batch_size: int,
+        *,
+        windows: bool = False,
+        successors: bool = False,
     ) -> Batch:
         """Draws transitions, uniformly with replacement from all windows of n steps.
 
@@ -142,6 +125,7 @@ class Replay(EpisodeRing):
           rng: source of the draw; it is advanced by one call.
           batch_size: B >= 1.
           windows: whether to add each window's own transitions.
+          successors: whether to add o_{t+1}.
 
         Returns:
           A batch of fresh arrays in C order.
@@ -149,22 +133,36 @@ class Replay(EpisodeRing):
         Raises:
           ValueError: if no stored episode is as long as a window.
         """
-        drawn = self.sample_indices(rng, batch_size, windows=windows)
-        # Both ends of the windows in one go: the work is shared out among threads.
-        # Where all of a window is asked for, its inside comes first of all.
-        first = drawn.observation[None]
-        if drawn.window is not None:
-            first = drawn.window.observation.swapaxes(0, 1)
-        slots = np.concatenate([first, drawn.next_observation[None]])
+        found = self.sample_indices(
+            rng, batch_size, windows=windows, successors=successors
+        )
+        # All stacks in one go: the work is shared out among threads.
+        parts = [found.observation[None], found.next_observation[None]]
+        if found.successor is not None:
+            parts.append(found.successor[None])
+        if found.window is not None:
+            parts.append(found.window.observation.swapaxes(0, 1))
+        slots = np.concatenate(parts)
         stacks = gather_stacks(self._frames, slots.reshape(-1, self._frame_stack))
         stacks = stacks.reshape(*slots.shape[:2], *stacks.shape[1:])
-        if drawn.window is not None:
-            inside = np.ascontiguousarray(stacks[:-1].swapaxes(0, 1))
-            drawn = drawn._replace(window=drawn.window._replace(observation=inside))
-        return drawn._replace(observation=stacks[0], next_observation=stacks[-1])
+        window = found.window
+        if window is not None:
+            inside = stacks[-self._window :].swapaxes(0, 1)
+            window = window._replace(observation=np.ascontiguousarray(inside))
+        return found._replace(
+            observation=stacks[0],
+            next_observation=stacks[1],
+            successor=None if found.successor is None else stacks[2],
+            window=window,
+        )
 
     def sample_indices(
-        self, rng: np.random.Generator, batch_size: int, *, windows: bool = False
+        self,
+        rng: np.random.Generator,
+        batch_size: int,
+        *,
+        windows: bool = False,
+        successors: bool = False,
     ) -> Batch:
         """Draws what `sample` draws, with the places of frames instead of pixels.
 
@@ -172,6 +170,7 @@ class Replay(EpisodeRing):
           rng: see `sample`; the same one gives the same transitions.
           batch_size: B >= 1.
           windows: see `sample`.
+          successors: see `sample`.
 
         Returns:
           A batch in which each stack [H, W, C * stack] is the int32 [stack] of its
@@ -216,6 +215,7 @@ class Replay(EpisodeRing):
             reward=(weights * rewards).sum(axis=1).astype(np.float32),
             discount=discounts[:, -1].astype(np.float32),
             next_observation=self._stack_slots(starts, steps + self._window),
+            successor=self._stack_slots(starts, steps + 1) if successors else None,
             window=window,
         )
 

@@ -1,4 +1,4 @@
-"""DAC on pixels, a baseline: rewards from a discriminator with eyes of its own."""
+"""DAC on pixels, a baseline: a discriminator with a separate encoder, relabelling."""
 
 import chex
 import jax
@@ -6,59 +6,72 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from jaxil.learner.rewarder import AgentView, Rewarder, Spec
+from jaxil import methods
+from jaxil.learner.rewarder import AgentSpec, AgentView, Rewarder, Spec
 from jaxil.learner.state import LearnerParams, ModuleState, init_module
 from jaxil.maths import augmentation
 from jaxil.maths.types import (
+    Batch,
     Episode,
     ExpertBatch,
     ExpertEpisodes,
     Metrics,
     Params,
-    Window,
 )
-from jaxil.networks.agent import AgentNetworks, apply
+from jaxil.networks.agent import apply
 from jaxil.networks.discriminator import PixelDiscriminator
 from jaxil.networks.encoder import PixelEncoder
 from jaxil.rewarders.discrimination import update_discriminator
 
+METHOD = methods.Method(
+    name="dac",
+    label="DAC",
+    about="adversarial rewards on pixels and actions",
+    colour="#56B4E9",
+    rank=3,
+    sections={"discriminator": methods.DISCRIMINATOR},
+    sees_actions=True,
+    metrics=(
+        "discriminator/loss",
+        "discriminator/penalty",
+        "discriminator/expert_logit",
+        "discriminator/agent_logit",
+    ),
+)
+
 Inputs = tuple[Array, Array]  # pixels in [0, 1], float [B, H, W, C]; actions [B, A]
 
 
-def make_dac_rewarder(
-    networks: AgentNetworks,
+def make_rewarder(
+    agent: AgentSpec,
     *,
-    feature_dim: int,
     hidden_dim: int,
     learning_rate: float,
-    penalty_weight: float,
+    gradient_penalty: float,
     batch_size: int,
-    frame_stack: int,
 ) -> Rewarder:
     """Returns the rewarder of DAC, extended to pixels.
 
         r_t = logit D(o_t, a_t)
 
-    D has its own convolutions, sees pixels that are not augmented and the expert's
-    actions, and rewards sampled transitions anew at each update: the three things
-    that P-DAC does differently. Its gradient penalty is on pixels and actions.
+    D has a separate encoder, sees pixels that are not augmented and the expert's
+    actions, and rewards are recomputed for every batch: three differences from P-DAC.
+    Its gradient penalty is on pixels and actions.
 
     Args:
-      networks: of the agent; the discriminator's encoder is made like its own.
-      feature_dim: D, of the trunk that squeezes the pixels before the action joins.
+      agent: the discriminator's encoder is made like its own.
       hidden_dim: width of the discriminator.
       learning_rate: of its Adam.
-      penalty_weight: weight of the gradient penalty.
-      batch_size: N, expert samples and agent samples in a step.
-      frame_stack: frames in an observation.
+      gradient_penalty: its weight.
+      batch_size: expert samples, and agent samples, in an update.
 
     Source: Kostrikov et al. 2019, arXiv:1809.02925, on pixels as in Cohen et al. 2021,
     sec. 4.1.
     """
-    encoder = networks.encoder
+    encoder = agent.networks.encoder
     if isinstance(encoder, PixelEncoder):  # the penalty differentiates it twice
         encoder = encoder.clone(native=False)
-    discriminator = PixelDiscriminator(encoder, feature_dim, hidden_dim)
+    discriminator = PixelDiscriminator(encoder, agent.feature_dim, hidden_dim)
     optimiser = optax.adam(learning_rate)
 
     def inputs(observation: Array, action: Array) -> Inputs:
@@ -82,7 +95,7 @@ def make_dac_rewarder(
     def update(
         state: ModuleState,
         learner: LearnerParams,
-        agent: AgentView,
+        view: AgentView,
         expert: ExpertBatch | None,
         key: Array,
     ) -> tuple[ModuleState, Metrics]:
@@ -93,14 +106,16 @@ def make_dac_rewarder(
             state,
             logits,
             inputs(expert.observation, expert.action),
-            inputs(agent.unshifted[:batch_size], agent.action[:batch_size]),
+            inputs(view.unshifted[:batch_size], view.action[:batch_size]),
             key,
-            penalty_weight=penalty_weight,
+            penalty_weight=gradient_penalty,
             optimiser=optimiser,
         )
 
-    def relabel(state: ModuleState, learner: LearnerParams, window: Window) -> Array:
+    def relabel(state: ModuleState, learner: LearnerParams, batch: Batch) -> Array:
         del learner
+        window = batch.window
+        assert window is not None
         chex.assert_equal_shape_prefix([window.observation, window.action], 2)
         observation, action = jax.tree.map(
             lambda x: jnp.reshape(x, (-1, *x.shape[2:])),
@@ -114,20 +129,19 @@ def make_dac_rewarder(
         learner: LearnerParams,
         episode: Episode,
         expert_episodes: ExpertEpisodes | None,
-    ) -> tuple[Array, ModuleState]:
-        # For people only: what the agent learns from is `relabel`.
+    ) -> Array:
+        # For the log only: the agent learns from `relabel`.
         del learner, expert_episodes
         observations = augmentation.stack_frames(
-            episode.frames, frame_stack=frame_stack
+            episode.frames, frame_stack=agent.frame_stack
         )
         x = inputs(observations[:-1], jnp.asarray(episode.actions))
-        return logits(state.params, x), state
+        return logits(state.params, x)
 
     return Rewarder(
+        rewards,
         init,
         update,
-        rewards,
-        samples_expert=True,
-        matches_episodes=False,
+        expert_batch_size=batch_size,
         relabel=relabel,
     )

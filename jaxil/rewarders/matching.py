@@ -38,32 +38,6 @@ class Matching(NamedTuple):
         """
         return closest_rewards(*self._costs_and_plans(agent, experts, num_moments))
 
-    def scaled_rewards(
-        self,
-        agent: Array,
-        experts: Array,
-        num_moments: Array,
-        *,
-        scale: Array,
-        return_scale: float,
-    ) -> tuple[Array, Array]:
-        """Returns rewards of an episode's transitions, and the scale that they have.
-
-        Args:
-          agent: features of o_0 ... o_T. Shape [T + 1, D].
-          experts: see `rewards`.
-          num_moments: see `rewards`.
-          scale: the one that is in force; 0 before the first episode. Shape [].
-          return_scale: minus the first episode's return; 10 in the paper.
-
-        Returns:
-          Rewards, of which the t-th is that of o_{t+1}, shape [T], and the scale that
-          is in force from now on, shape [].
-        """
-        unscaled = self.rewards(agent, experts, num_moments)[1:]
-        scale = scale_of_first_episode(scale, unscaled, return_scale)
-        return scale * unscaled, scale
-
     def closest_plan(self, agent: Array, experts: Array, num_moments: Array) -> Array:
         """Returns the plan behind `rewards`. Shape [T, N]."""
         costs, plans = self._costs_and_plans(agent, experts, num_moments)
@@ -87,7 +61,8 @@ def closest_rewards(costs: Array, plans: Array) -> Array:
         k* = argmin_k <C_k, P_k>,    r_t = - sum_n C_k*tn P_k*tn
 
     The paper compares entropic distances; the reference compares transport costs
-    without their entropy, as here. At epsilon 0.01 they rank alike.
+    without their entropy, as here. At epsilon 0.01 the two choose alike but for near
+    ties: 1 of 40 draws of near-identical demonstrations differed.
 
     Args:
       costs: one matrix for each demonstration. Shape [K, T, N].
@@ -103,17 +78,15 @@ def closest_rewards(costs: Array, plans: Array) -> Array:
     return candidates[jnp.argmax(jnp.sum(candidates, axis=1))]
 
 
-def scale_of_first_episode(scale: Array, unscaled: Array, return_scale: float) -> Array:
-    """Returns the factor that gives the first episode the return `-return_scale`.
+def scale_of_first_episode(unscaled: Array, return_scale: float) -> Array:
+    """Returns the factor that gives an episode the return `-return_scale`.
 
     Args:
-      scale: the one that is in force; 0 before the first episode. Shape [].
-      unscaled: rewards of an episode. Shape [T].
+      unscaled: its rewards. Shape [T].
       return_scale: 10 in the paper.
     """
-    chex.assert_rank([scale, unscaled], [0, 1])
-    first = return_scale / jnp.maximum(-jnp.sum(unscaled), _COST_FLOOR)
-    return jnp.where(scale > 0.0, scale, first)
+    chex.assert_rank(unscaled, 1)
+    return return_scale / jnp.maximum(-jnp.sum(unscaled), _COST_FLOOR)
 
 
 def make_matching(

@@ -6,25 +6,46 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from jaxil.learner.rewarder import AgentView, Rewarder, Spec
+from jaxil import methods
+from jaxil.learner.rewarder import AgentSpec, AgentView, Rewarder, Spec
 from jaxil.learner.state import LearnerParams, ModuleState, init_module
 from jaxil.maths import augmentation
 from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes, Metrics, Params
-from jaxil.networks.agent import AgentNetworks, apply, critic_features
+from jaxil.networks.agent import apply, critic_features
 from jaxil.networks.discriminator import Discriminator
 from jaxil.rewarders.discrimination import update_discriminator
 
+METHOD = methods.Method(
+    name="pdac",
+    label="P-DAC",
+    about="adversarial rewards on the critic's features",
+    colour="#0072B2",
+    rank=1,
+    sections={
+        "discriminator": {
+            **methods.DISCRIMINATOR,
+            "sees_actions": methods.Field(False, "appends actions to the features"),
+        }
+    },
+    sees_actions="discriminator.sees_actions",
+    metrics=(
+        "discriminator/loss",
+        "discriminator/penalty",
+        "discriminator/expert_logit",
+        "discriminator/agent_logit",
+    ),
+    variations=(methods.Variation("discriminator.sees_actions", False, "actions"),),
+)
 
-def make_adversarial_rewarder(
-    networks: AgentNetworks,
+
+def make_rewarder(
+    agent: AgentSpec,
     *,
     hidden_dim: int,
     learning_rate: float,
-    penalty_weight: float,
+    gradient_penalty: float,
     batch_size: int,
     sees_actions: bool,
-    shift_padding: int,
-    frame_stack: int,
 ) -> Rewarder:
     """Returns the rewarder of P-DAC.
 
@@ -35,14 +56,12 @@ def make_adversarial_rewarder(
     paper's reward, is the logit itself, and only the logit stays finite in float32.
 
     Args:
-      networks: of the agent; only the encoder and the critic's trunk are used.
+      agent: only its encoder and the critic's trunk are used.
       hidden_dim: width of the discriminator.
       learning_rate: of its Adam.
-      penalty_weight: weight of the gradient penalty; 10 in the paper.
-      batch_size: N, expert samples and agent samples in a step.
+      gradient_penalty: its weight.
+      batch_size: expert samples, and agent samples, in an update.
       sees_actions: whether actions are appended to the features: D(o_t, a_t).
-      shift_padding: of the random shift; 0 for none.
-      frame_stack: frames in an observation.
 
     Source: Cohen et al. 2021, sec. 3.2; sizes and rates, which the paper leaves
     out, from siddhanthaldar/ROT.
@@ -67,7 +86,7 @@ def make_adversarial_rewarder(
     def update(
         state: ModuleState,
         learner: LearnerParams,
-        agent: AgentView,
+        view: AgentView,
         expert: ExpertBatch | None,
         key: Array,
     ) -> tuple[ModuleState, Metrics]:
@@ -75,18 +94,18 @@ def make_adversarial_rewarder(
         chex.assert_axis_dimension(expert.observation, 0, batch_size)
         shift_key, penalty_key = jax.random.split(key)
         observation = augmentation.augment(
-            expert.observation, shift_key, padding=shift_padding
+            expert.observation, shift_key, padding=agent.shift_padding
         )
         features = critic_features(
-            networks, learner.encoder, learner.critic, observation
+            agent.networks, learner.encoder, learner.critic, observation
         )
         return update_discriminator(
             state,
             logits,
             inputs(features, expert.action),
-            inputs(agent.features[:batch_size], agent.action[:batch_size]),
+            inputs(view.features[:batch_size], view.action[:batch_size]),
             penalty_key,
-            penalty_weight=penalty_weight,
+            penalty_weight=gradient_penalty,
             optimiser=optimiser,
         )
 
@@ -95,21 +114,22 @@ def make_adversarial_rewarder(
         learner: LearnerParams,
         episode: Episode,
         expert_episodes: ExpertEpisodes | None,
-    ) -> tuple[Array, ModuleState]:
+    ) -> Array:
         del expert_episodes
         observations = augmentation.stack_frames(
-            episode.frames, frame_stack=frame_stack
+            episode.frames, frame_stack=agent.frame_stack
         )
         # r(o_{t+1}), as in the reference; with actions the pair is (o_t, a_t).
         judged = observations[:-1] if sees_actions else observations[1:]
-        features = critic_features(networks, learner.encoder, learner.critic, judged)
-        return logits(state.params, inputs(features, episode.actions)), state
+        features = critic_features(
+            agent.networks, learner.encoder, learner.critic, judged
+        )
+        return logits(state.params, inputs(features, episode.actions))
 
     return Rewarder(
+        rewards,
         init,
         update,
-        rewards,
-        samples_expert=True,
-        matches_episodes=False,
+        expert_batch_size=batch_size,
         rewards_changed=lambda state: True,
     )

@@ -1,4 +1,4 @@
-"""SIL on pixels, a baseline: transport in an embedding that learns to tell apart."""
+"""SIL on pixels, a baseline: transport in an adversarially trained embedding."""
 
 import chex
 import jax
@@ -7,7 +7,8 @@ import optax
 from flax import struct
 from jax import Array
 
-from jaxil.learner.rewarder import AgentView, Rewarder, Spec
+from jaxil import methods
+from jaxil.learner.rewarder import AgentSpec, AgentView, Rewarder, Spec
 from jaxil.learner.state import (
     LearnerParams,
     ModuleState,
@@ -16,9 +17,29 @@ from jaxil.learner.state import (
 )
 from jaxil.maths import augmentation, transport
 from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes, Metrics, Params
-from jaxil.networks.agent import AgentNetworks, apply
+from jaxil.networks.agent import apply
 from jaxil.networks.discriminator import Embedding
-from jaxil.rewarders.matching import Matching
+from jaxil.rewarders.matching import (
+    Matching,
+    make_matching,
+    scale_of_first_episode,
+)
+
+METHOD = methods.Method(
+    name="sil",
+    label="SIL",
+    about="optimal transport in an adversarially trained embedding",
+    colour="#E69F00",
+    rank=4,
+    sections={
+        "sinkhorn": methods.SINKHORN,
+        "discriminator": {
+            "learning_rate": methods.DISCRIMINATOR["learning_rate"],
+            "batch_size": methods.DISCRIMINATOR["batch_size"],
+        },
+    },
+    metrics=("sinkhorn/scale", "sinkhorn/distance"),
+)
 
 
 class SilState(struct.PyTreeNode):
@@ -33,43 +54,49 @@ class SilState(struct.PyTreeNode):
     scale: Array
 
 
-def make_sil_rewarder(
-    networks: AgentNetworks,
+def make_rewarder(
+    agent: AgentSpec,
     *,
-    matching: Matching,
-    feature_dim: int,
+    cost: str,
+    alignment: str,
+    epsilon: float,
+    num_iterations: int,
+    return_scale: float,
     learning_rate: float,
     batch_size: int,
-    return_scale: float,
-    frame_stack: int,
 ) -> Rewarder:
     """Returns the rewarder of SIL, extended to pixels.
 
         max_f  <C_f, P_f>,    r_t = - scale * sum_n C_tn P_tn
 
-    The embedding f, with convolutions of its own, is trained to make the Sinkhorn
-    distance between a batch of the agent's observations and one of the expert's as
-    large as it can; an episode is rewarded by the live f, without a target copy, as
-    in P-SIL otherwise. Pixels are not augmented.
+    The embedding f, with a separate encoder, is trained to maximise the Sinkhorn
+    distance between a batch of the agent's observations and one of the expert's; an
+    episode is rewarded by the live f, without a target copy, as in P-SIL otherwise.
+    Pixels are not augmented.
 
     Args:
-      networks: of the agent; the embedding's encoder is made like its own.
-      matching: cost and plan.
-      feature_dim: D.
-      learning_rate: of the embedding's Adam.
-      batch_size: N, expert and agent samples in a step.
+      agent: the embedding's encoder is made like its own.
+      cost: these four: see `make_matching`.
+      alignment: see there.
+      epsilon: see there.
+      num_iterations: see there.
       return_scale: the first episode returns minus this.
-      frame_stack: frames in an observation.
+      learning_rate: of the embedding's Adam.
+      batch_size: expert samples, and agent samples, in an update.
 
     Source: Papagiannis and Li 2020, arXiv:2008.09167, sec. 3, on pixels as in Cohen
-    et al. 2021, sec. 4.1. They embed whole episodes; batches, as discriminators have,
-    give the off-policy learner one step of f for each of its own.
+    et al. 2021, sec. 4.1. The original differs in more than pixels: it embeds whole
+    episodes, on policy, into 10 linear outputs, at a learning rate of 5e-4. Batches,
+    as discriminators have, give the off-policy learner one step of f per update.
     """
-    embedding = Embedding(networks.encoder, feature_dim)
+    matching = make_matching(
+        cost=cost, alignment=alignment, epsilon=epsilon, num_iterations=num_iterations
+    )
+    embedding = Embedding(agent.networks.encoder, agent.feature_dim)
     optimiser = optax.adam(learning_rate)
 
     def embed(params: Params, frames: Array) -> Array:
-        observations = augmentation.stack_frames(frames, frame_stack=frame_stack)
+        observations = augmentation.stack_frames(frames, frame_stack=agent.frame_stack)
         return apply(embedding, params, observations)
 
     def init(key: Array, spec: Spec, learner: LearnerParams) -> SilState:
@@ -80,14 +107,14 @@ def make_sil_rewarder(
     def update(
         state: SilState,
         learner: LearnerParams,
-        agent: AgentView,
+        view: AgentView,
         expert: ExpertBatch | None,
         key: Array,
     ) -> tuple[SilState, Metrics]:
         del learner, key
         assert expert is not None
         chex.assert_axis_dimension(expert.observation, 0, batch_size)
-        both = jnp.concatenate([agent.unshifted[:batch_size], expert.observation])
+        both = jnp.concatenate([view.unshifted[:batch_size], expert.observation])
 
         def loss(params: Params) -> Array:
             mine, experts = jnp.split(apply(embedding, params, both), 2)
@@ -107,23 +134,38 @@ def make_sil_rewarder(
         experts = jax.lax.map(lambda f: embed(params, f), expert_episodes.frames)
         return embed(params, episode.frames), experts
 
+    def unscaled(
+        state: SilState, episode: Episode, expert_episodes: ExpertEpisodes | None
+    ) -> Array:
+        assert expert_episodes is not None
+        mine, experts = features(state, episode, expert_episodes)
+        # Reward t is that of o_{t+1}.
+        return matching.rewards(mine, experts, expert_episodes.num_frames)[1:]
+
+    def observe(
+        state: SilState,
+        learner: LearnerParams,
+        episode: Episode,
+        expert_episodes: ExpertEpisodes | None,
+    ) -> SilState:
+        del learner
+        scale = jax.lax.cond(
+            state.scale > 0.0,
+            lambda: state.scale,
+            lambda: scale_of_first_episode(
+                unscaled(state, episode, expert_episodes), return_scale
+            ),
+        )
+        return state.replace(scale=scale)
+
     def rewards(
         state: SilState,
         learner: LearnerParams,
         episode: Episode,
         expert_episodes: ExpertEpisodes | None,
-    ) -> tuple[Array, SilState]:
+    ) -> Array:
         del learner
-        assert expert_episodes is not None
-        mine, experts = features(state, episode, expert_episodes)
-        rewards, scale = matching.scaled_rewards(
-            mine,
-            experts,
-            expert_episodes.num_frames,
-            scale=state.scale,
-            return_scale=return_scale,
-        )
-        return rewards, state.replace(scale=scale)
+        return state.scale * unscaled(state, episode, expert_episodes)
 
     def plan(
         state: SilState,
@@ -136,10 +178,11 @@ def make_sil_rewarder(
         return matching.closest_plan(mine, experts, expert_episodes.num_frames)
 
     return Rewarder(
+        rewards,
         init,
         update,
-        rewards,
-        samples_expert=True,
+        observe,
+        expert_batch_size=batch_size,
         matches_episodes=True,
         summary=lambda state: {"sinkhorn/scale": state.scale},
         rewards_changed=lambda state: True,

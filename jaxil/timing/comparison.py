@@ -5,7 +5,7 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any
 
-from jaxil.command import UsageError
+from jaxil.errors import UsageError
 from jaxil.timing.tables import ROWS
 
 # Whatever jaxil wrote the file, old or new, it has these.

@@ -3,8 +3,8 @@
 from typing import Any, NamedTuple
 
 from jaxil import config as jaxil_config
-from jaxil.command import UsageError, listing
 from jaxil.config import Config
+from jaxil.errors import UsageError
 from jaxil.training import assembly
 
 _EXAMPLE = "such as --sweep=batch_size:64,128,256"
@@ -50,7 +50,7 @@ def parse(text: str, config: Config) -> Sweep:
             fault for fault in assembly.problems(configs[value]) if fault not in faults
         ]
     if faults:
-        raise UsageError(listing(faults))
+        raise UsageError(faults)
     return Sweep(field, configs)
 
 

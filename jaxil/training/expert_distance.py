@@ -13,13 +13,14 @@ from jax import Array
 from jaxil.config import Config
 from jaxil.demonstrations import loading
 from jaxil.environments.evaluation import evaluate
-from jaxil.environments.interaction import FinishedEpisode
 from jaxil.files.metrics import write_atomically
 from jaxil.maths import transport
+from jaxil.maths.types import Episode
 from jaxil.networks.discriminator import Embedding
 from jaxil.networks.encoder import PixelEncoder, StateEncoder
 from jaxil.replay.stacking import gather_stacks
 from jaxil.training import assembly
+from jaxil.training.agent import stack_size
 
 # The same for every method and run, so that their distances can be compared.
 _ENCODER_SEED = 0
@@ -63,9 +64,7 @@ class Closeness:
         self._config = config
         self._path = workdir / "random_policy.json"
         frames = demonstrations.frames[:_MAX_DEMONSTRATIONS]
-        self._embed = make_random_embedding(
-            frames.shape[2:], assembly.stack_size(config)
-        )
+        self._embed = make_random_embedding(frames.shape[2:], stack_size(config))
         self._distance = jax.jit(mean_distance)
         self._experts = self._embed_all(
             [
@@ -76,11 +75,11 @@ class Closeness:
             ]
         )
 
-    def relative_distance(self, episodes: list[FinishedEpisode]) -> float:
+    def relative_distance(self, episodes: list[Episode]) -> float:
         """Returns the distance of an evaluation's episodes; a random policy has 1."""
         return self._mean_distance(episodes) / self._of_random_policy()
 
-    def _mean_distance(self, episodes: list[FinishedEpisode]) -> float:
+    def _mean_distance(self, episodes: list[Episode]) -> float:
         agent = self._embed_all([episode.frames for episode in episodes])
         return float(self._distance(agent, self._experts))
 

@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from jaxil import methods
 from jaxil.config import Config
 from jaxil.demonstrations import loading
 from jaxil.environments.evaluation import Evaluation
 from jaxil.files import metrics, video
 
-# Diagnostics in train.csv, whatever the method; a method leaves the others' empty.
-METRIC_COLUMNS = (
+# The learner's diagnostics in train.csv; the method's own follow.
+LEARNER_COLUMNS = (
     "critic/loss",
     "critic/value",
     "critic/target",
@@ -21,12 +22,6 @@ METRIC_COLUMNS = (
     "actor/loss",
     "actor/pre_tanh",
     "exploration_std",
-    "discriminator/loss",
-    "discriminator/penalty",
-    "discriminator/expert_logit",
-    "discriminator/agent_logit",
-    "sinkhorn/scale",
-    "sinkhorn/distance",
 )
 # Beyond this mean |pre-tanh|, the gradient of tanh is below 1 %.
 _SATURATED = 3.0
@@ -48,7 +43,11 @@ class Outputs:
         self._metrics = metrics.Metrics(
             workdir,
             resume_frame=resume_frame,
-            extra_train_columns=("reward_seconds", *METRIC_COLUMNS),
+            extra_train_columns=(
+                "reward_seconds",
+                *LEARNER_COLUMNS,
+                *methods.get(config.method).metrics,
+            ),
             extra_eval_columns=("actor_pre_tanh",),
         )
         self._expert_frames: np.ndarray | None = None

@@ -25,15 +25,6 @@ class Stopwatch:
         return call
 
 
-class TimedEnvironment:
-    """An environment whose resets and steps are added up as "environment"."""
-
-    def __init__(self, environment: Any, stopwatch: Stopwatch) -> None:
-        self.reset = stopwatch.timed("environment", environment.reset)
-        self.step = stopwatch.timed("environment", environment.step)
-        self.single_observation = environment.single_observation
-
-
 class TimedPool:
     """A pool whose processes' time, as far as one waits for it, is "environment"."""
 
@@ -42,3 +33,4 @@ class TimedPool:
         self.reset = stopwatch.timed("environment", pool.reset)
         self.step = stopwatch.timed("environment", pool.step)
         self.receive = stopwatch.timed("environment", pool.receive)
+        self.close = pool.close

@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxil.command import UsageError
 from jaxil.config import Config
 from jaxil.demonstrations import loading
 from jaxil.environments.suite import PixelEnvironment
+from jaxil.errors import UsageError
 from jaxil.learner.state import LearnerParams
+from jaxil.training import agent as agents
 from jaxil.training import assembly, workdir
 from jaxil.training.checkpoint import CheckpointError, Checkpoints
 
@@ -59,18 +60,18 @@ def load(folder: pathlib.Path) -> Trained:
     config = workdir.read_config(folder)
     faults = assembly.problems(config)
     if faults:
-        raise UsageError(f"{folder / 'config.json'}: {'; '.join(faults)}")
+        raise UsageError(f"{folder / 'config.json'}: {'; '.join(map(str, faults))}")
     environment = assembly.evaluation_environment(config)
     demonstrations = assembly.load_demonstrations(config)
-    agent = assembly.make_agent(config, environment, demonstrations)
+    agent = agents.make_agent(config, environment, demonstrations)
     try:
-        state, counters = Checkpoints(folder).restore(assembly.abstract_state(agent))
+        state, counters = Checkpoints(folder).restore(agents.abstract_state(agent))
     except CheckpointError as error:
         raise UsageError(str(error)) from error
     encoder, actor, _ = state.params
 
     def act(observation: np.ndarray) -> np.ndarray:
-        return np.asarray(agent.exploit(encoder, actor, observation))
+        return np.asarray(agent.mean_action(encoder, actor, observation[None]))[0]
 
     return Trained(
         config=config,

@@ -1,29 +1,29 @@
-"""The learner's updates: their batches drawn, collected, brought to the device, run."""
+"""The learner's updates: batches sampled, collected, sent to the device, run."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxil import methods
 from jaxil.config import Config
 from jaxil.demonstrations import loading
 from jaxil.learner.gathering import Frames
 from jaxil.learner.state import TrainState
-from jaxil.maths.types import Batch, ExpertBatch, ExpertEpisodes, Metrics, Window
+from jaxil.maths.types import Batch, ExpertBatch, ExpertEpisodes, Metrics
 from jaxil.replay.device_copy import Mirror
 from jaxil.replay.replay import Replay
-from jaxil.training import assembly
-from jaxil.training.assembly import Agent
+from jaxil.training.agent import Agent, stack_size
 
-Drawn = tuple[Batch | None, ExpertBatch | None]
+Sampled = tuple[Batch | None, ExpertBatch | None]
 
 _REFRESH_EPISODES = 8  # in one call; bounds what leaves the host's memory at once
 
 
 class Updates:
-    """Draws a batch for each update that is due, and runs so many at once.
+    """Samples a batch for each update that is due, and runs several at once.
 
-    With `replay_on_device`, frames lie on the device and batches name their places;
-    without, batches are stacked on the host and sent whole. Both draw the same ones.
+    With `replay_on_device`, frames are on the device and batches hold their indices;
+    without, batches are stacked on the host and sent whole. The samples are the same.
     """
 
     def __init__(
@@ -34,7 +34,7 @@ class Updates:
         demonstrations: loading.Demonstrations | None,
         experts: ExpertEpisodes | None,
     ) -> None:
-        """Copies the frames to the device, where they shall lie there.
+        """Copies the frames to the device, if they are to be there.
 
         Args:
           config: checked.
@@ -48,28 +48,29 @@ class Updates:
         self._replay = replay
         self._demonstrations = demonstrations
         self._experts = experts
-        self._pending: list[Drawn] = []
-        self._clones = config.method == "bc"
-        self._mirror: Mirror | None = None
+        self._pending: list[Sampled] = []
+        self._plays = methods.get(config.method).plays
+        self._device_copy: Mirror | None = None
         self._expert_frames: jax.Array | None = None
         if config.replay_on_device:
-            if not self._clones:
-                self._mirror = Mirror(replay)
+            if self._plays:
+                self._device_copy = Mirror(replay)
             if experts is not None:
                 self._expert_frames = experts.frames  # no second copy
-            elif demonstrations is not None and self._samples_expert:
+            elif demonstrations is not None and agent.rewarder.expert_batch_size:
                 self._expert_frames = jnp.asarray(demonstrations.frames)
 
     @property
-    def _samples_expert(self) -> bool:
-        return self._clones or self._agent.rewarder.samples_expert
+    def is_pending(self) -> bool:
+        """Whether collected updates have not run yet."""
+        return bool(self._pending)
 
     def collect(self, rng: np.random.Generator) -> bool:
-        """Draws for one update; says whether there are enough to be run.
+        """Samples for one update; returns whether there are enough to be run.
 
         Until they are run, no episode may enter the replay.
         """
-        self._pending.append(self.draw(rng))
+        self._pending.append(self.sample(rng))
         return len(self._pending) >= self._config.updates_per_dispatch
 
     def run(self, state: TrainState) -> tuple[TrainState, Metrics | None]:
@@ -94,8 +95,8 @@ class Updates:
 
     def episode_added(self) -> None:
         """Follows the replay, after an episode has entered it."""
-        if self._mirror is not None:
-            self._mirror.refresh()
+        if self._device_copy is not None:
+            self._device_copy.refresh()
 
     def refresh_rewards(self, state: TrainState) -> None:
         """Recomputes the rewards of all stored episodes with the rewarder as it is.
@@ -122,8 +123,8 @@ class Updates:
     def _refreshed(self, state: TrainState, indices: list[int]) -> np.ndarray:
         slots = np.stack([self._replay.slots(index) for index in indices])
         actions = np.stack([self._replay.actions(index) for index in indices])
-        if self._mirror is not None:
-            frames = self._mirror.frames
+        if self._device_copy is not None:
+            frames = self._device_copy.frames
         else:
             frames = self._replay.frames[slots.ravel()]
             slots = np.arange(slots.size).reshape(slots.shape)
@@ -138,39 +139,37 @@ class Updates:
         return np.asarray(rewards)
 
     def frames(self) -> Frames | None:
-        """Returns the frames that lie on the device; None where none do.
+        """Returns the frames that are on the device; None where none are.
 
         An episode that enters the replay replaces them.
         """
         if not self._config.replay_on_device:
             return None
-        agent = None if self._mirror is None else self._mirror.frames
-        return Frames(agent, self._expert_frames)
+        copied = self._device_copy
+        return Frames(None if copied is None else copied.frames, self._expert_frames)
 
-    def draw(self, rng: np.random.Generator) -> Drawn:
-        """Draws what one update learns from."""
-        config = self._config
-        batch = expert = None
-        if not self._clones:
-            on_host = self._mirror is None
-            draw = self._replay.sample if on_host else self._replay.sample_indices
-            windows = self._agent.rewarder.relabel is not None
-            drawn = draw(rng, config.batch_size, windows=windows)
-            window = None if drawn.window is None else Window(*drawn.window)
-            batch = Batch(*drawn[:-1], window=window)
-        if self._samples_expert:
-            expert = self._draw_expert(rng)
-        return batch, expert
-
-    def _draw_expert(self, rng: np.random.Generator) -> ExpertBatch:
+    def sample(self, rng: np.random.Generator) -> Sampled:
+        """Samples what one update learns from."""
+        rewarder, batch = self._agent.rewarder, None
+        if self._plays:
+            on_host = self._device_copy is None
+            sample = self._replay.sample if on_host else self._replay.sample_indices
+            batch = sample(
+                rng,
+                self._config.batch_size,
+                windows=rewarder.relabel is not None,
+                successors=rewarder.samples_successors,
+            )
+        if not rewarder.expert_batch_size:
+            return batch, None
         assert self._demonstrations is not None
         on_host = self._expert_frames is None
-        draw = loading.sample if on_host else loading.sample_indices
-        group = self._config.cloning if self._clones else self._config.discriminator
-        drawn = draw(
+        sample = loading.sample if on_host else loading.sample_indices
+        expert = sample(
             self._demonstrations,
             rng,
-            group.batch_size,
-            frame_stack=assembly.stack_size(self._config),
+            rewarder.expert_batch_size,
+            frame_stack=stack_size(self._config),
+            successors=rewarder.samples_successors,
         )
-        return ExpertBatch(*drawn)
+        return batch, expert

@@ -8,8 +8,8 @@ import pathlib
 from collections.abc import Iterator
 from typing import Any
 
-from jaxil.command import UsageError
 from jaxil.config import Config, default_config
+from jaxil.errors import UsageError
 
 # A run may be prolonged, or be computed in another way, without becoming another run.
 _FREE_FIELDS = ("total_frames", "encoder.convolutions", "replay_on_device")

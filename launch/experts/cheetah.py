@@ -83,7 +83,7 @@ def load_judge(folder: pathlib.Path) -> tuple[Judge, Any, str]:
     import jax
     import jax.numpy as jnp
 
-    from jaxil.command import UsageError
+    from jaxil.errors import UsageError
     from jaxil.networks.agent import apply
     from jaxil.training import assembly, trained, workdir
 
@@ -125,7 +125,7 @@ def main(argv: list[str]) -> None:
     )
     values = parser.parse_args(argv)
     print(startup.prepare(), file=sys.stderr, flush=True)
-    from jaxil.command import UsageError
+    from jaxil.errors import UsageError
 
     try:
         studio.write(

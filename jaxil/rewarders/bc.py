@@ -1,24 +1,58 @@
-"""Behavioural cloning: the learning step of the baseline that never plays."""
+"""Behavioural cloning, a baseline: the policy copies the expert's actions.
+
+The agent never acts in the environment, and its frames count updates: as many as other
+methods would make in that time.
+"""
 
 import chex
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxil import methods
+from jaxil.learner.rewarder import AgentSpec, Rewarder
 from jaxil.learner.state import TrainState, apply_gradients
 from jaxil.learner.update import Learner, UpdateStep
 from jaxil.maths import augmentation, losses
 from jaxil.maths.types import Batch, ExpertBatch, Metrics, Params
 from jaxil.networks.agent import apply
+from jaxil.rewarders.zero import zero_rewards
+
+METHOD = methods.Method(
+    name="bc",
+    label="BC",
+    about="the expert's actions, by behavioural cloning",
+    colour="#009E73",
+    rank=5,
+    sections={
+        "cloning": {
+            "batch_size": methods.Field(128, "expert samples; 128 in ROT", 1, 65_536),
+            "std": methods.Field(
+                0.1, "of the policy whose likelihood is raised; 0.1", 1e-6, 10.0
+            ),
+        }
+    },
+    make_update_step="make_update_step",
+    sees_actions=True,
+    plays=False,
+    total_updates=55_000,
+)
 
 
-def make_cloning_step(learner: Learner, *, std: float) -> UpdateStep:
+def make_rewarder(agent: AgentSpec, *, batch_size: int, std: float) -> Rewarder:
+    """Returns a rewarder of nothing; it asks for expert samples."""
+    del agent, std
+    return Rewarder(zero_rewards, expert_batch_size=batch_size)
+
+
+def make_update_step(learner: Learner, *, batch_size: int, std: float) -> UpdateStep:
     """Returns the step that trains encoder and actor on the expert's actions.
 
-    Critic and rewarder stay as they were made; the batch of the agent is None.
+    Critic and rewarder stay as they were made; the agent's batch is None.
 
     Args:
       learner: networks and hyperparameters.
+      batch_size: expert samples.
       std: see `losses.cloning_loss`.
 
     Source: Cohen et al. 2021, sec. 4.1, the BC baseline; siddhanthaldar/ROT,
@@ -31,6 +65,7 @@ def make_cloning_step(learner: Learner, *, std: float) -> UpdateStep:
         del batch
         assert expert is not None
         chex.assert_rank(expert.action, 2)
+        chex.assert_axis_dimension(expert.action, 0, batch_size)
         observation = augmentation.augment(
             expert.observation,
             jax.random.fold_in(state.key, state.num_updates),

@@ -1,0 +1,186 @@
+"""Episodes in one or several environments, which step while the learner learns."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxil.environments.interaction import Environments, Moment
+from jaxil.maths.types import Episode
+
+
+class InProcess:
+    """One environment of this process, as `Environments`: it steps when waited for."""
+
+    size = 1
+
+    def __init__(self, environment: Any) -> None:
+        """Takes a `PixelEnvironment`, or anything with its methods."""
+        self._environment = environment
+        self._order: Callable[[], Any] = lambda: None
+
+    def reset(self, index: int, episode: int) -> None:
+        """See `Environments`."""
+        del index
+        self._order = lambda: self._environment.reset(episode=episode)
+
+    def step(self, index: int, action: np.ndarray) -> None:
+        """See `Environments`."""
+        del index
+        self._order = lambda: self._environment.step(action)
+
+    def receive(self, index: int) -> Moment:
+        """See `Environments`."""
+        del index
+        timestep = self._order()
+        return Moment(
+            observation=timestep.observation,
+            frame=self._environment.single_observation(),
+            task_reward=float(timestep.reward or 0.0),
+            discount=1.0 if timestep.discount is None else float(timestep.discount),
+            is_last=timestep.last(),
+        )
+
+    def close(self) -> None:
+        """Does nothing: the environment is its maker's."""
+
+
+@dataclasses.dataclass
+class _Open:
+    """An episode that is being played, so far."""
+
+    number: int
+    observation: np.ndarray | None = None
+    is_last: bool = False
+    frames: list[np.ndarray] = dataclasses.field(default_factory=list)
+    actions: list[np.ndarray] = dataclasses.field(default_factory=list)
+    rewards: list[float] = dataclasses.field(default_factory=list)
+    discounts: list[float] = dataclasses.field(default_factory=list)
+
+    def add(self, moment: Moment) -> None:
+        self.observation, self.is_last = moment.observation, moment.is_last
+        if self.frames:  # the first moment is that of a reset
+            self.rewards.append(moment.task_reward)
+            self.discounts.append(moment.discount)
+        self.frames.append(moment.frame)
+
+    def finished(self) -> Episode:
+        return Episode(
+            frames=np.stack(self.frames),
+            actions=np.stack(self.actions),
+            rewards=np.asarray(self.rewards, np.float32),
+            discounts=np.asarray(self.discounts, np.float32),
+        )
+
+
+class Player:
+    """Plays episodes: `begin`, `step`, then `observe`, again and again.
+
+    Episode i starts from the state that `reset(episode=i)` gives, whichever
+    environment plays it. A lost environment's episode is played again from its start.
+    """
+
+    def __init__(
+        self,
+        environments: Environments,
+        *,
+        first_episode: int,
+        open_episodes: Mapping[int, np.ndarray] | None = None,
+    ) -> None:
+        """Starts nothing yet.
+
+        Args:
+          environments: at least one.
+          first_episode: number of the first episode that has not begun.
+          open_episodes: actions [t, A] of episodes, by number, that an earlier
+            process had begun: they are repeated, and the episodes go on from there.
+        """
+        self._environments = environments
+        self._next_episode = first_episode
+        self._waiting = dict(open_episodes or {})  # to be begun first
+        self._open: dict[int, _Open] = {}  # by environment
+
+    def begin(self, wanted: Callable[[int], bool]) -> None:
+        """Starts an episode in each free environment.
+
+        Args:
+          wanted: asked for each new episode, by its number, whether to play it.
+        """
+        begun = []
+        for index in range(self._environments.size):
+            if index in self._open:
+                continue
+            number = min(self._waiting, default=self._next_episode)
+            if number not in self._waiting and not wanted(number):
+                break
+            if number == self._next_episode:
+                self._next_episode += 1
+            self._environments.reset(index, number)
+            self._open[index] = _Open(number)
+            begun.append((index, self._waiting.pop(number, ())))
+        for index, actions in begun:
+            self._receive(index)
+            for action in actions:
+                if index in self._open:
+                    self._step(index, action)
+                    self._receive(index)
+
+    @property
+    def observations(self) -> np.ndarray:
+        """What the open episodes show, in the order of their numbers: [E, ...]."""
+        shown = [self._open[index].observation for index in self._order()]
+        return np.stack([each for each in shown if each is not None])
+
+    @property
+    def is_playing(self) -> bool:
+        """Whether any episode is open."""
+        return bool(self._open)
+
+    @property
+    def open_episodes(self) -> dict[int, np.ndarray]:
+        """The actions [t, A] of each open episode by its number."""
+        found = {e.number: np.array(e.actions) for e in self._open.values()}
+        return {**{n: np.array(a) for n, a in self._waiting.items()}, **found}
+
+    def steps_left(self, episode_steps: int) -> int:
+        """Returns the agent steps that open episodes of a length still need."""
+        played = [len(episode.actions) for episode in self._open.values()]
+        return sum(max(episode_steps - steps, 0) for steps in played)
+
+    def step(self, actions: np.ndarray) -> None:
+        """Sends actions [E, A], in the order of `observations`; does not wait."""
+        for index, action in zip(self._order(), actions, strict=True):
+            self._step(index, action)
+
+    def observe(self) -> list[Episode]:
+        """Waits for what comes of the actions.
+
+        Returns:
+          The episodes that ended, in the order of their numbers.
+        """
+        finished = []
+        for index in self._order():
+            self._receive(index)
+            if index in self._open and self._open[index].is_last:
+                finished.append(self._open.pop(index).finished())
+        return finished
+
+    def close(self) -> None:
+        """Ends the environments' processes."""
+        self._environments.close()
+
+    def _order(self) -> list[int]:
+        return sorted(self._open, key=lambda index: self._open[index].number)
+
+    def _step(self, index: int, action: np.ndarray) -> None:
+        action = np.asarray(action, np.float32)
+        self._open[index].actions.append(action)
+        self._environments.step(index, action)
+
+    def _receive(self, index: int) -> None:
+        moment = self._environments.receive(index)
+        if moment is None:  # lost, and the episode with it
+            self._waiting[self._open.pop(index).number] = np.zeros((0, 0))
+        else:
+            self._open[index].add(moment)

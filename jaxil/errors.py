@@ -1,0 +1,68 @@
+"""What a user got wrong, as data: field, value, rule, way out."""
+
+import dataclasses
+import difflib
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+_SHORT_LIST = 12  # names that a message may list in full
+_ABSENT = object()
+
+
+@dataclasses.dataclass(frozen=True)
+class Fault:
+    """One reason why a request is refused.
+
+    Attributes:
+      subject: the config field, flag or file that is wrong.
+      rule: what is wrong with it, as the rest of a sentence that begins with it.
+      way_out: what to do instead; empty if the rule says it.
+      value: what was given; shown unless left out.
+    """
+
+    subject: str
+    rule: str
+    way_out: str = ""
+    value: Any = _ABSENT
+
+    def __str__(self) -> str:
+        given = "" if self.value is _ABSENT else f"={self.value!r}"
+        end = f"; {self.way_out}" if self.way_out else ""
+        return f"{self.subject}{given} {self.rule}{end}"
+
+    def __hash__(self) -> int:
+        return hash(str(self))  # values need not be hashable
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Fault) and str(self) == str(other)
+
+
+class UsageError(Exception):
+    """The user asked for something that is not possible.
+
+    Attributes:
+      faults: every reason, at least one.
+    """
+
+    def __init__(self, faults: "str | Fault | Iterable[str | Fault]") -> None:
+        if isinstance(faults, str | Fault):
+            faults = [faults]
+        self.faults: tuple[str | Fault, ...] = tuple(faults)
+        super().__init__(self.faults)
+
+    def __str__(self) -> str:
+        if len(self.faults) == 1:
+            return str(self.faults[0])
+        return "Invalid configuration:\n" + "\n".join(f"  - {f}" for f in self.faults)
+
+
+def unknown_name(subject: str, value: object, known: Sequence[str]) -> Fault:
+    """Returns the fault of a name that does not exist, with the closest that do."""
+    if len(known) <= _SHORT_LIST:
+        return Fault(
+            subject, "is unknown", f"choose one of: {', '.join(known)}", value=value
+        )
+    close = difflib.get_close_matches(str(value), known, n=3, cutoff=0.5)
+    shown = ", ".join(close) if close else f"{', '.join(known[:_SHORT_LIST])}, ..."
+    hint = "did you mean" if close else "choose one of"
+    return Fault(subject, "is unknown", f"{hint}: {shown}", value=value)

@@ -1,0 +1,216 @@
+"""Imitation methods as declarations that can be read without importing jax.
+
+A method is one file: its rewarder, and beside it `METHOD = methods.Method(...)`. The
+files of `jaxil/rewarders`, and those that installed packages name under the entry
+points `jaxil.methods`, are known by their method's name; any other by
+`--config.method=package.module:METHOD`.
+
+A declaration is evaluated on its own, so that the report, sweeps and `--help` start
+without jax: it may use this module, under the name `methods`, and literals. Where it
+needs more, its file is imported.
+"""
+
+import ast
+import functools
+import importlib
+import importlib.metadata
+import importlib.util
+import pathlib
+import sys
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from jaxil.errors import Fault, UsageError, unknown_name
+
+_FOLDER = pathlib.Path(__file__).parent / "rewarders"
+_ENTRY_POINTS = "jaxil.methods"
+
+
+class Field(NamedTuple):
+    """One setting.
+
+    Attributes:
+      default: the paper's value, or the reference's; its type is the field's.
+      about: what it is and what is usual, for `--help` and messages.
+      low: smallest value of a number.
+      high: largest value of a number.
+      choices: of a name; empty if any text will do.
+      positive: whether a number must lie above `low`, not at it.
+    """
+
+    default: Any
+    about: str
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+    positive: bool = False
+
+
+class Variation(NamedTuple):
+    """A field that makes an ablation of the method.
+
+    Attributes:
+      field: dotted, such as "sinkhorn.cost".
+      plain: the value of the method itself.
+      words: what figures call another value; "{}" stands for it.
+    """
+
+    field: str
+    plain: Any
+    words: str
+
+
+class Method(NamedTuple):
+    """What the program knows of a method.
+
+    Attributes:
+      name: how configs name it; `reference` for methods from outside.
+      label: how figures and tables name it.
+      about: what it learns from, in a few words.
+      colour: of its curves, "#rrggbb".
+      rank: where it stands in tables and legends: small numbers first.
+      sections: its config sections. Their fields are keyword arguments of
+        `make_rewarder`, or of `make_update_step` where there is one.
+      make_rewarder: (AgentSpec, **fields) -> Rewarder: a function of its file.
+      make_update_step: (Learner, **fields) -> UpdateStep: a function of its file that
+        replaces the learner's own step; None for the learner's.
+      uses_demonstrations: whether it imitates anything.
+      sees_actions: whether it reads the expert's actions, or the field that decides.
+      plays: whether the agent acts in the environment; a method that does not learns
+        from demonstrations alone, and its frames count updates.
+      total_updates: length of a run of a method that does not play.
+      metrics: columns of train.csv beside those of the learner.
+      variations: fields that make ablations.
+    """
+
+    name: str
+    label: str
+    about: str
+    colour: str = "#5b5b5b"
+    rank: int = 100
+    sections: Mapping[str, Mapping[str, Field]] = {}
+    make_rewarder: str = "make_rewarder"
+    make_update_step: str | None = None
+    uses_demonstrations: bool = True
+    sees_actions: bool | str = False
+    plays: bool = True
+    total_updates: int = 0
+    metrics: tuple[str, ...] = ()
+    variations: tuple[Variation, ...] = ()
+
+
+DISCRIMINATOR = {
+    "hidden_dim": Field(1024, "width of its hidden layers; 1024 in ROT", 1, 10**5),
+    "learning_rate": Field(1e-4, "of its Adam; 1e-4 in ROT", 0, 1, positive=True),
+    "gradient_penalty": Field(10.0, "weight of it; 10 in the paper", 0, 1e6),
+    "batch_size": Field(
+        128, "expert samples, and agent samples, in an update; 128 in ROT", 1, 65_536
+    ),
+}
+SINKHORN = {
+    "cost": Field("cosine", "between features", choices=("cosine", "euclidean")),
+    "alignment": Field(
+        "transport",
+        "which moments are compared; time: moment t with moment t",
+        choices=("transport", "time"),
+    ),
+    "epsilon": Field(
+        0.01, "weight of the entropy, in units of cost; 0.01 in ROT", 1e-6, 1e3
+    ),
+    "num_iterations": Field(100, "of Sinkhorn; 100 in ROT", 1, 10**6),
+    "return_scale": Field(
+        10.0, "the first episode returns minus this; 10 in the paper", 1e-6, 1e6
+    ),
+}
+TARGETS = {
+    "target_update_steps": Field(
+        10_000, "agent steps between two target copies; 10000 in the paper", 1, 10**9
+    ),
+}
+
+
+def known() -> dict[str, Method]:
+    """Returns the methods that configs may name, by name, in the order of tables."""
+    found = {name: _declaration(ref) for name, ref in _references().items()}
+    return dict(sorted(found.items(), key=lambda item: (item[1].rank, item[0])))
+
+
+def get(name: str) -> Method:
+    """Returns a method.
+
+    Args:
+      name: a key of `known()`, or "package.module:METHOD".
+
+    Raises:
+      UsageError: there is no such method.
+    """
+    reference = _references().get(name)
+    if reference is None and ":" not in name:
+        raise UsageError(
+            unknown_name("method", name, (*known(), "package.module:METHOD"))
+        )
+    return _declaration(reference or name)._replace(name=name)
+
+
+def load(name: str, function: str) -> Any:
+    """Imports a method's file and returns one of its functions."""
+    module = _references().get(name, name).partition(":")[0]
+    return getattr(importlib.import_module(module), function)
+
+
+@functools.cache
+def _references() -> dict[str, str]:
+    files = sorted(p for p in _FOLDER.glob("*.py") if _assignment(p, "METHOD"))
+    own = {p.stem: f"jaxil.rewarders.{p.stem}:METHOD" for p in files}
+    points = importlib.metadata.entry_points(group=_ENTRY_POINTS)
+    return {**{point.name: point.value for point in points}, **own}
+
+
+@functools.cache
+def _declaration(reference: str) -> Method:
+    module, _, name = reference.partition(":")
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, ValueError):
+        spec = None
+    if spec is None or not spec.origin:
+        raise UsageError(
+            Fault(
+                "method",
+                f"names no module {module!r} that Python finds",
+                "install its package, or add its folder to PYTHONPATH",
+                value=reference,
+            )
+        )
+    expression = _assignment(pathlib.Path(spec.origin), name or "METHOD")
+    method: Any = None
+    try:
+        if expression is not None:
+            here = sys.modules[__name__]
+            code = compile(ast.Expression(expression), spec.origin, "eval")
+            method = eval(code, {"methods": here})
+    except NameError:  # it uses names of its own file
+        pass
+    if method is None:
+        method = getattr(importlib.import_module(module), name or "METHOD", None)
+    if not isinstance(method, Method):
+        raise UsageError(
+            Fault(
+                "method",
+                f"is not declared: {module!r} has no `{name} = methods.Method(...)`",
+                value=reference,
+            )
+        )
+    return method
+
+
+@functools.cache
+def _assignment(path: pathlib.Path, name: str) -> ast.expr | None:
+    """Returns the value that a file's top level assigns to a name."""
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.Assign) and any(
+            isinstance(target, ast.Name) and target.id == name
+            for target in node.targets
+        ):
+            return node.value
+    return None

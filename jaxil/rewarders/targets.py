@@ -1,0 +1,163 @@
+"""What methods share that compare episodes under target copies of the actor's trunk."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from jaxil.learner.rewarder import AgentSpec, Rewarder, Spec
+from jaxil.learner.state import LearnerParams, copy_params
+from jaxil.maths import augmentation
+from jaxil.maths.types import Episode, ExpertEpisodes, Params
+from jaxil.networks.agent import actor_features
+from jaxil.rewarders.matching import scale_of_first_episode
+
+# (agent features [T + 1, D], expert features [K, N + 1, D], frames of each that are its
+# own [K]) -> rewards [T + 1] of o_0 ... o_T, or a plan [T + 1, N + 1].
+Compare = Callable[[Array, Array, Array], Array]
+
+
+class TargetState(struct.PyTreeNode):
+    """What such a method remembers between episodes.
+
+    Attributes:
+      target_encoder: copy of the live encoder.
+      target_actor: copy of the live actor, of which the trunk is used.
+      expert_features: demonstrations under the copies. Shape [K, N + 1, D].
+      scale: factor on rewards, set by the first episode; 0 before. Shape [].
+      steps_since_copy: agent steps in episodes since the last copy. Shape [].
+    """
+
+    target_encoder: Params
+    target_actor: Params
+    expert_features: Array
+    scale: Array
+    steps_since_copy: Array
+
+
+def make_target_rewarder(
+    agent: AgentSpec,
+    *,
+    compare: Compare,
+    plan: Compare | None,
+    target_update_steps: int,
+    return_scale: float | None,
+) -> Rewarder:
+    """Returns a rewarder of whole episodes under slowly changing features.
+
+    The copies are taken at the end of the first episode that finds at least
+    `target_update_steps` agent steps gone by since the last time, and at the first
+    episode of all, when the live networks are still as initialised.
+
+    Args:
+      agent: only its encoder and the actor's trunk are used.
+      compare: features to rewards, before scaling.
+      plan: the transport plan behind them; None without one.
+      target_update_steps: agent steps between copies.
+      return_scale: the first episode's rewards are scaled to return minus this, and
+        that scale stays; None: rewards are not scaled.
+    """
+
+    def embed(encoder: Params, actor: Params, frames: Array) -> Array:
+        observations = augmentation.stack_frames(frames, frame_stack=agent.frame_stack)
+        return actor_features(agent.networks, encoder, actor, observations)
+
+    def init(key: Array, spec: Spec, learner: LearnerParams) -> TargetState:
+        del key
+        shape = (spec.num_demonstrations, spec.expert_steps + 1, spec.feature_dim)
+        return TargetState(
+            target_encoder=copy_params(learner.encoder),
+            target_actor=copy_params(learner.actor),
+            expert_features=jnp.zeros(shape),
+            scale=jnp.ones(()) if return_scale is None else jnp.zeros(()),
+            # As if the last copy were long ago, so that the first episode copies.
+            steps_since_copy=jnp.asarray(target_update_steps, jnp.int32),
+        )
+
+    def copy_targets(
+        state: TargetState, learner: LearnerParams, expert_episodes: ExpertEpisodes
+    ) -> TargetState:
+        # One demonstration at a time: all at once would need gigabytes.
+        expert_features = jax.lax.map(
+            lambda frames: embed(learner.encoder, learner.actor, frames),
+            expert_episodes.frames,
+        )
+        return TargetState(
+            target_encoder=learner.encoder,
+            target_actor=learner.actor,
+            expert_features=expert_features,
+            scale=state.scale,
+            steps_since_copy=jnp.zeros((), jnp.int32),
+        )
+
+    def unscaled(
+        compared: Compare,
+        state: TargetState,
+        episode: Episode,
+        expert_episodes: ExpertEpisodes | None,
+    ) -> Array:
+        assert expert_episodes is not None
+        features = embed(state.target_encoder, state.target_actor, episode.frames)
+        return compared(features, state.expert_features, expert_episodes.num_frames)
+
+    def scaled(
+        state: TargetState, episode: Episode, expert_episodes: ExpertEpisodes
+    ) -> TargetState:
+        def first_scale() -> Array:
+            assert return_scale is not None
+            rewards = unscaled(compare, state, episode, expert_episodes)[1:]
+            return scale_of_first_episode(rewards, return_scale)
+
+        scale = jax.lax.cond(state.scale > 0.0, lambda: state.scale, first_scale)
+        return state.replace(scale=scale)
+
+    def observe(
+        state: TargetState,
+        learner: LearnerParams,
+        episode: Episode,
+        expert_episodes: ExpertEpisodes | None,
+    ) -> TargetState:
+        assert expert_episodes is not None
+        num_steps = jnp.asarray(episode.actions.shape[0], jnp.int32)
+        state = state.replace(steps_since_copy=state.steps_since_copy + num_steps)
+        state = jax.lax.cond(
+            state.steps_since_copy >= target_update_steps,
+            lambda old: copy_targets(old, learner, expert_episodes),
+            lambda old: old,
+            state,
+        )
+        return (
+            state if return_scale is None else scaled(state, episode, expert_episodes)
+        )
+
+    def rewards(
+        state: TargetState,
+        learner: LearnerParams,
+        episode: Episode,
+        expert_episodes: ExpertEpisodes | None,
+    ) -> Array:
+        del learner
+        # Reward t is that of o_{t+1}.
+        return state.scale * unscaled(compare, state, episode, expert_episodes)[1:]
+
+    def plan_of(
+        state: TargetState,
+        learner: LearnerParams,
+        episode: Episode,
+        expert_episodes: ExpertEpisodes,
+    ) -> Array:
+        del learner
+        assert plan is not None
+        return unscaled(plan, state, episode, expert_episodes)
+
+    return Rewarder(
+        rewards,
+        init,
+        observe=observe,
+        matches_episodes=True,
+        rewards_changed=lambda state: state.steps_since_copy == 0,
+        plan=None if plan is None else plan_of,
+        summary=lambda state: {"sinkhorn/scale": state.scale},
+    )

@@ -1,0 +1,245 @@
+"""From a checked config to the compiled functions of an agent."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import optax
+
+from jaxil import methods
+from jaxil.config import Config
+from jaxil.demonstrations import loading
+from jaxil.environments.suite import PixelEnvironment
+from jaxil.learner.gathering import Step, make_gathering_step, make_repeated_step
+from jaxil.learner.policy import (
+    MeanAction,
+    SampleAction,
+    make_mean_action,
+    make_sample_action,
+)
+from jaxil.learner.rewarder import AgentSpec, Rewarder, Spec, make_refresh
+from jaxil.learner.state import TrainState
+from jaxil.learner.update import (
+    Learner,
+    init_train_state,
+    make_update_step,
+)
+from jaxil.maths.types import ExpertEpisodes
+from jaxil.native import build, encoding
+from jaxil.networks.agent import AgentNetworks, make_agent_networks
+
+
+class Agent(NamedTuple):
+    """The compiled functions of a run, and what they start from.
+
+    Attributes:
+      update_step: (state, batch, expert batch, frames=None) -> (state, metrics);
+        donates state; see `gathering.make_gathering_step`.
+      repeated_step: the same for several batches, see `gathering.make_repeated_step`.
+      sample_action: see `policy.make_sample_action`.
+      mean_action: see `policy.make_mean_action`.
+      observe: the rewarder's.
+      rewards: the rewarder's.
+      refresh: rewards of stored episodes as of now, see `rewarder.make_refresh`.
+      plan: the rewarder's; None where it has none.
+      rewarder: the method itself.
+      init_state: () -> the state before the first update.
+    """
+
+    update_step: Step
+    repeated_step: Step
+    sample_action: SampleAction
+    mean_action: MeanAction
+    observe: Any
+    rewards: Any
+    refresh: Any
+    plan: Any
+    rewarder: Rewarder
+    init_state: Any
+
+
+def stack_size(config: Config) -> int:
+    """Returns the frames in an observation: state vectors are not stacked."""
+    return config.frame_stack if config.observation == "pixels" else 1
+
+
+def exploration_schedule(config: Config) -> optax.Schedule:
+    """Returns the noise's standard deviation by agent step."""
+    return optax.linear_schedule(
+        config.exploration_std_start,
+        config.exploration_std_end,
+        config.exploration_std_steps,
+    )
+
+
+def make_networks(config: Config, action_dim: int, mean: Any) -> AgentNetworks:
+    """Returns the agent's networks.
+
+    Args:
+      config: checked.
+      action_dim: A.
+      mean: what the encoder subtracts, in [0, 1]: a number or [H, W, C].
+    """
+    return make_agent_networks(
+        action_dim=action_dim,
+        feature_dim=config.feature_dim,
+        hidden_dim=config.hidden_dim,
+        observation=config.observation,
+        channels=tuple(config.encoder.channels),
+        kernel_sizes=tuple(config.encoder.kernel_sizes),
+        strides=tuple(config.encoder.strides),
+        contrast=config.encoder.contrast,
+        mean=mean,
+        compute_dtype=config.compute_dtype,
+        native=uses_native_convolutions(config),
+    )
+
+
+def uses_native_convolutions(config: Config) -> bool:
+    """Returns whether the encoder's convolutions are our own, and loads them if so."""
+    wanted = config.encoder.convolutions != "xla" and native_fault(config) is None
+    return wanted and build.problem() is None
+
+
+def native_fault(config: Config) -> str | None:
+    """Returns why our own convolutions are not for a config."""
+    if config.observation != "pixels":
+        return f"they are for pixels, not observation={config.observation!r}"
+    if config.compute_dtype != "float32":
+        return f"they are for float32, not compute_dtype={config.compute_dtype!r}"
+    channels = tuple(config.encoder.channels)
+    if any(each % encoding.FEATURES for each in channels):
+        return (
+            f"they make multiples of {encoding.FEATURES} channels, not "
+            f"encoder.channels={channels}"
+        )
+    if len(channels) > encoding.MOST_LAYERS:
+        return (
+            f"they have at most {encoding.MOST_LAYERS} layers, not the {len(channels)} "
+            f"of encoder.channels={channels}"
+        )
+    return None
+
+
+def mean_image(
+    config: Config,
+    demonstrations: loading.Demonstrations | None,
+) -> Any:
+    """Returns what the encoder subtracts: 0.5, or the demonstrations' mean image."""
+    if not config.encoder.subtract_mean_image or demonstrations is None:
+        return 0.5
+    total = np.zeros(demonstrations.frames.shape[2:], np.float64)
+    lengths = demonstrations.num_frames
+    for episode, length in zip(demonstrations.frames, lengths, strict=True):
+        # One at a time: bounded memory.
+        total += episode[:length].sum(axis=0, dtype=np.float64)
+    mean = (total / lengths.sum() / 255.0).astype(np.float32)
+    return np.concatenate([mean] * config.frame_stack, axis=-1)
+
+
+def make_rewarder(config: Config, networks: AgentNetworks) -> Rewarder:
+    """Returns the rewarder of the method that the config names."""
+    method = methods.get(config.method)
+    agent = AgentSpec(
+        networks=networks,
+        feature_dim=config.feature_dim,
+        frame_stack=stack_size(config),
+        shift_padding=config.shift_padding,
+    )
+    make = methods.load(config.method, method.make_rewarder)
+    return make(agent, **_own_fields(config))
+
+
+def _own_fields(config: Config) -> dict[str, Any]:
+    """Returns the fields of a method's own sections, by name."""
+    own: dict[str, Any] = {}
+    for section in methods.get(config.method).sections:
+        own |= config[section].to_dict()
+    return own
+
+
+def make_agent(
+    config: Config,
+    environment: PixelEnvironment,
+    demonstrations: loading.Demonstrations | None,
+) -> Agent:
+    """Returns the compiled functions of a run.
+
+    Args:
+      config: checked.
+      environment: read for its specs only.
+      demonstrations: what the method imitates, or None.
+    """
+    action_dim = environment.action_spec().shape[0]
+    networks = make_networks(config, action_dim, mean_image(config, demonstrations))
+    rewarder = make_rewarder(config, networks)
+    schedule = exploration_schedule(config)
+    first_update = config.seed_frames // config.action_repeat
+    learner = Learner(
+        networks=networks,
+        rewarder=rewarder,
+        learning_rate=config.learning_rate,
+        critic_target_tau=config.critic_target_tau,
+        noise_clip=config.noise_clip,
+        shift_padding=config.shift_padding,
+        pre_tanh_penalty=config.pre_tanh_penalty,
+        exploration_std=lambda num_updates: schedule(
+            first_update + num_updates * config.update_every_steps
+        ),
+    )
+    observation = np.zeros(
+        environment.observation_spec().shape, environment.observation_spec().dtype
+    )
+    frames = None if demonstrations is None else demonstrations.frames
+    spec = Spec(
+        action_dim=action_dim,
+        feature_dim=config.feature_dim,
+        num_demonstrations=0 if frames is None else frames.shape[0],
+        expert_steps=0 if frames is None else frames.shape[1] - 1,
+        observation_shape=observation.shape,
+    )
+    method = methods.get(config.method)
+    step = make_update_step(learner)
+    if method.make_update_step is not None:
+        make_step = methods.load(config.method, method.make_update_step)
+        step = make_step(learner, **_own_fields(config))
+    step = make_gathering_step(step)
+    return Agent(
+        # The old state is dead after the call, so XLA may reuse its memory.
+        update_step=jax.jit(step, donate_argnums=0),
+        repeated_step=jax.jit(make_repeated_step(step), donate_argnums=0),
+        sample_action=jax.jit(make_sample_action(networks, schedule)),
+        mean_action=jax.jit(make_mean_action(networks)),
+        observe=jax.jit(rewarder.observe),
+        rewards=jax.jit(rewarder.rewards),
+        refresh=jax.jit(make_refresh(rewarder)),
+        plan=None if rewarder.plan is None else jax.jit(rewarder.plan),
+        rewarder=rewarder,
+        # Compiled, and kept in the cache: one by one, its 450 operations take longer.
+        init_state=jax.jit(
+            lambda: init_train_state(
+                learner, jax.random.key(config.seed), observation, spec
+            )
+        ),
+    )
+
+
+def expert_episodes(
+    rewarder: Rewarder, demonstrations: loading.Demonstrations | None
+) -> ExpertEpisodes | None:
+    """Puts the demonstrations on the device, where the method matches episodes."""
+    if not rewarder.matches_episodes or demonstrations is None:
+        return None
+    actions = demonstrations.actions
+    if actions is None:
+        actions = np.zeros((*demonstrations.frames.shape[:1], 0, 0), np.float32)
+    return ExpertEpisodes(
+        jax.numpy.asarray(demonstrations.frames),
+        jax.numpy.asarray(demonstrations.num_frames),
+        jax.numpy.asarray(actions),
+    )
+
+
+def abstract_state(agent: Agent) -> TrainState:
+    """Returns shapes and dtypes of the learner's state, for a checkpoint to fill."""
+    return jax.eval_shape(agent.init_state)

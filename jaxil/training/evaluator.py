@@ -1,0 +1,106 @@
+"""Evaluations of a run: episodes of the mean action, and how the method sees them."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxil.config import Config
+from jaxil.environments.evaluation import Evaluation, evaluate
+from jaxil.environments.suite import PixelEnvironment
+from jaxil.learner.state import TrainState
+from jaxil.maths.types import Episode, ExpertEpisodes
+from jaxil.training.agent import Agent
+from jaxil.training.expert_distance import Closeness
+
+
+class Result(NamedTuple):
+    """One evaluation.
+
+    Attributes:
+      evaluation: what was played.
+      distance: to the expert, relative to a random policy's; None if unknown.
+      filmed: arrays that belong to the video, see `Evaluator.explain`.
+    """
+
+    evaluation: Evaluation
+    distance: float | None
+    filmed: dict[str, np.ndarray]
+
+
+class Evaluator:
+    """Evaluates a policy in an environment that training does not use."""
+
+    def __init__(
+        self,
+        config: Config,
+        agent: Agent,
+        environment: PixelEnvironment,
+        experts: ExpertEpisodes | None,
+        distance: Closeness | None,
+    ) -> None:
+        """See `train.make_run`."""
+        self._config = config
+        self._agent = agent
+        self.environment = environment
+        self._experts = experts
+        self._distance = distance
+
+    def evaluate(
+        self,
+        state: TrainState,
+        *,
+        number: int,
+        is_last: bool,
+        stop_asked: Callable[[], bool],
+    ) -> Result | None:
+        """Plays the episodes of one evaluation.
+
+        Args:
+          state: the learner's.
+          number: evaluations before this one, which fixes the episodes' starts.
+          is_last: whether the run ends with it, so that it is filmed.
+          stop_asked: asked between agent steps.
+
+        Returns:
+          None if it was stopped.
+        """
+        del stop_asked
+        config = self._config
+        encoder, actor, _ = state.params
+
+        def act(observation: np.ndarray) -> np.ndarray:
+            return np.asarray(
+                self._agent.mean_action(encoder, actor, observation[None])
+            )[0]
+
+        every = config.video_every_evals
+        evaluation = evaluate(
+            self.environment,
+            act,
+            num_episodes=config.num_eval_episodes,
+            first_episode=number * config.num_eval_episodes,
+            record_video=every > 0 and (number % every == 0 or is_last),
+        )
+        distance, filmed = None, {}
+        if self._distance is not None:
+            distance = self._distance.relative_distance(evaluation.episodes)
+        if evaluation.video is not None:
+            filmed = self.explain(state, evaluation.episodes[0])
+        return Result(evaluation, distance, filmed)
+
+    def explain(self, state: TrainState, episode: Episode) -> dict[str, np.ndarray]:
+        """Returns what the method makes of an episode, to look at.
+
+        Returns:
+          `task_rewards` [T], `imitation_rewards` [T], and the transport plan
+          `plan` [T + 1, N + 1] of methods that have one.
+        """
+        arguments = (state.rewarder, state.params, episode, self._experts)
+        found = {
+            "task_rewards": episode.rewards,
+            "imitation_rewards": np.asarray(self._agent.rewards(*arguments)),
+        }
+        if self._agent.plan is not None:
+            found["plan"] = np.asarray(self._agent.plan(*arguments))
+        return found
