@@ -106,9 +106,7 @@ class Run:
         resumed = self.frame if self.counters.num_steps else None
         self.outputs = run_log.Outputs(workdir, config, demonstrations, resumed)
         self.progress = ProgressLine(config.total_frames, first_frame=self.frame)
-        self.pool = assembly.training_pool(
-            config, self.environment, lambda text: self.say(text)
-        )
+        self.pool = assembly.training_pool(config, lambda text: self.say(text))
 
     @property
     def frame(self) -> int:

@@ -24,7 +24,7 @@ from jaxil.files import archive
 
 FORMAT = "jaxil-demonstrations"
 VERSION = 1
-MAX_ARRAY_BYTES = archive.MAX_MEMBER_BYTES
+MAX_ARRAY_BYTES = archive.MAX_BYTES
 _MAX_METADATA_BYTES = 1024**2
 _ARRAYS = {  # name: dtype, number of axes, states per episode beyond its steps
     "qpos": (np.dtype(np.float64), 3, 1),
@@ -166,7 +166,7 @@ def read_states(
         is damaged, or is not what was asked for.
     """
     path = pathlib.Path(path)
-    limits = dict.fromkeys(_ARRAYS, archive.MAX_MEMBER_BYTES)
+    limits = dict.fromkeys(_ARRAYS, archive.MAX_BYTES)
     limits["metadata"] = _MAX_METADATA_BYTES
     try:
         arrays = archive.read_archive(path, max_bytes=limits)

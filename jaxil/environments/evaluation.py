@@ -1,6 +1,7 @@
 """How good a policy is by the task's own reward."""
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 
@@ -17,9 +18,9 @@ class Evaluation(NamedTuple):
     """Episodes of one policy.
 
     Attributes:
-      episodes: what was seen and done in each.
+      episodes: E of them.
       task_returns: undiscounted sums of the task's reward. Shape [E].
-      video: images of the first episode, uint8 [T + 1, H, W, 3]; None if not asked.
+      video: images of the first episode, uint8 [T + 1, H, W, 3]; None if not asked for.
     """
 
     episodes: list[FinishedEpisode]
@@ -37,6 +38,7 @@ class Evaluation(NamedTuple):
         return float(np.std(self.task_returns))
 
 
+@overload
 def evaluate(
     environment: Any,
     act: Act,
@@ -44,15 +46,38 @@ def evaluate(
     num_episodes: int,
     first_episode: int,
     record_video: bool = False,
-) -> Evaluation:
+) -> Evaluation: ...
+@overload
+def evaluate(
+    environment: Any,
+    act: Act,
+    *,
+    num_episodes: int,
+    first_episode: int,
+    record_video: bool = False,
+    stop_asked: Callable[[], bool],
+) -> Evaluation | None: ...
+def evaluate(
+    environment: Any,
+    act: Act,
+    *,
+    num_episodes: int,
+    first_episode: int,
+    record_video: bool = False,
+    stop_asked: Callable[[], bool] = lambda: False,
+) -> Evaluation | None:
     """Plays whole episodes without learning.
 
     Args:
-      environment: one that nothing else uses, with `frame()` for videos.
+      environment: an `Environment` that nothing else uses, with `frame()` for videos.
       act: the policy; deterministic for the numbers that are reported.
-      num_episodes: how many, at least 1.
+      num_episodes: at least 1.
       first_episode: number of the first, which fixes how each one starts.
       record_video: whether to keep the first episode's images.
+      stop_asked: asked after each decision; True ends the evaluation.
+
+    Returns:
+      The evaluation; None if it was stopped.
     """
     episodes: list[FinishedEpisode] = []
     returns: list[float] = []
@@ -73,5 +98,7 @@ def evaluate(
             played = []
             if len(episodes) == num_episodes:
                 break
+        if stop_asked():
+            return None
     video = np.stack(images) if record_video else None
     return Evaluation(episodes, np.asarray(returns), video)

@@ -1,20 +1,55 @@
-"""The agent and its environment, one decision at a time, or one of each of several."""
+"""The agent and its environment, or several of them, one decision at a time."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import dm_env
 import numpy as np
+from dm_env import specs
 
 Act = Callable[[np.ndarray], np.ndarray]  # observation -> action [A]
 ActTogether = Callable[[np.ndarray], np.ndarray]  # observations [E, ...] -> [E, A]
+
+
+@runtime_checkable
+class Environment(Protocol):
+    """What the training loop needs of a simulator; time runs in agent steps.
+
+    A `PixelEnvironment` is one; implement these methods to train in another simulator.
+    """
+
+    @property
+    def episode_steps(self) -> int | None:
+        """Agent steps of a whole episode; None where only the task ends it."""
+        ...
+
+    def observation_spec(self) -> specs.Array:
+        """Returns the spec of observations: uint8 [H, W, C] or float32 [S]."""
+        ...
+
+    def action_spec(self) -> specs.BoundedArray:
+        """Returns the spec of actions: float32 [A] in [-1, 1]."""
+        ...
+
+    def reset(self, episode: int) -> dm_env.TimeStep:
+        """Starts an episode, whose number alone fixes its start."""
+        ...
+
+    def step(self, action: np.ndarray) -> dm_env.TimeStep:
+        """Applies an action; the discount stays 1 where a time limit ends the episode."""
+        ...
+
+    def single_observation(self) -> np.ndarray:
+        """Returns the present frame, not stacked: uint8 [H, W, 3] or float32 [S]."""
+        ...
 
 
 class Decision(NamedTuple):
     """One agent step.
 
     Attributes:
-      frame: what came of it, not stacked. uint8 [H, W, 3] or float32 [S].
+      frame: its outcome, not stacked. uint8 [H, W, 3] or float32 [S].
       first_frame: on an episode's first decision, the frame at its reset; else None.
       action: shape [A].
       task_reward: summed over the action repeat.
@@ -41,16 +76,12 @@ def interact(
 ) -> Iterator[Decision]:
     """Yields decisions without end, episode after episode.
 
-    Episode i starts from the state that `environment.reset(episode=i)` gives, so a
-    resumed run meets the same starts as an unbroken one.
-
     Args:
-      environment: a `PixelEnvironment`, or anything with its `reset(episode)`,
-        `step(action)` and `single_observation()`.
+      environment: an `Environment`; of it, `reset`, `step` and `single_observation`.
       act: the policy.
       first_episode: number of the first episode.
       meanwhile: called between a decision's action and its step: what it starts on a
-        device goes on while the simulator steps and draws.
+        device runs while the simulator steps and renders.
     """
     episode = first_episode
     while True:
@@ -61,20 +92,20 @@ def interact(
             meanwhile()
             timestep = environment.step(action)
             yield Decision(
-                frame=environment.single_observation(),
-                first_frame=first_frame,
-                action=action,
-                task_reward=float(timestep.reward),
-                discount=float(timestep.discount),
-                is_last=timestep.last(),
-                episode=episode,
+                environment.single_observation(),
+                first_frame,
+                action,
+                float(timestep.reward),
+                float(timestep.discount),
+                timestep.last(),
+                episode,
             )
             first_frame = None
         episode += 1
 
 
 class Moment(NamedTuple):
-    """What an environment shows after a reset or a step; arrays are the reader's.
+    """What an environment shows after a reset or a step.
 
     Attributes:
       observation: what the policy sees. uint8 [H, W, C] or float32 [S].
@@ -92,30 +123,30 @@ class Moment(NamedTuple):
 
 
 class Environments(Protocol):
-    """Several environments that work while one waits; see `pool.Pool`."""
+    """Several environments, by index, that work at the same time; see `pool.Pool`."""
 
     size: int
 
-    def reset(self, place: int, episode: int) -> None:
+    def reset(self, index: int, episode: int, /) -> None:
         """Sends an environment to the start of an episode."""
         ...
 
-    def step(self, place: int, action: np.ndarray) -> None:
+    def step(self, index: int, action: np.ndarray, /) -> None:
         """Sends it an action."""
         ...
 
-    def receive(self, place: int) -> Moment | None:
+    def receive(self, index: int, /) -> Moment | None:
         """Waits for the outcome; None if it was lost, and the episode with it."""
         ...
 
 
 @dataclasses.dataclass
-class _Seat:
-    """Where an episode is played: what it shows, and at its start the first frame."""
+class _Played:
+    """An episode under way: what it shows now, and at its start the first frame."""
 
     episode: int
-    moment: Moment | None = None
-    first_frame: np.ndarray | None = None
+    moment: Moment
+    first_frame: np.ndarray | None
 
 
 def interact_together(
@@ -128,30 +159,23 @@ def interact_together(
 ) -> Iterator[list[Decision]]:
     """Yields rounds without end: one decision of each environment that plays.
 
-    Each episode is one that `interact` could have played. A free environment is given
-    the lowest number that is left; an episode that was lost is played again from its
-    start. Rounds are sorted by the episodes' numbers, and empty if nothing plays.
+    Each episode is one that `interact` could have played. A free environment plays the
+    lowest number that is left; a lost episode is played again from its start. Rounds
+    are sorted by the episodes' numbers, and empty if nothing plays.
 
     Args:
       environments: at least one.
       act: the policy; its rows are sorted as the round is.
       first_episode: number of the first episode.
-      begin: asked before each episode, whether it is to be played.
-      meanwhile: called once for each decision, between the sending of the actions and
-        the waiting for what comes of them.
+      begin: asked before each episode whether to play it.
+      meanwhile: called once for each decision, after the actions are sent and before
+        their outcomes are awaited.
     """
     next_episode, lost = first_episode, []
-    seats: dict[int, _Seat] = {}  # by place
-
-    def receive(place: int) -> Moment | None:
-        moment = environments.receive(place)
-        if moment is None:
-            lost.append(seats.pop(place).episode)
-        return moment
-
+    playing: dict[int, _Played] = {}  # by index of the environment
     while True:
-        free = [place for place in range(environments.size) if place not in seats]
-        for place in free:
+        started = {}
+        for index in sorted(set(range(environments.size)) - set(playing)):
             episode = min(lost, default=next_episode)
             if not begin(episode):
                 break
@@ -159,41 +183,40 @@ def interact_together(
                 lost.remove(episode)
             else:
                 next_episode += 1
-            environments.reset(place, episode)
-            seats[place] = _Seat(episode)
-        for place in [place for place in free if place in seats]:
-            if (moment := receive(place)) is not None:
-                seats[place].moment, seats[place].first_frame = moment, moment.frame
+            environments.reset(index, episode)
+            started[index] = episode
+        for index, episode in started.items():
+            if (moment := environments.receive(index)) is None:
+                lost.append(episode)
+            else:
+                playing[index] = _Played(episode, moment, moment.frame)
 
-        places = sorted(seats, key=lambda place: seats[place].episode)
-        moments = [seats[place].moment for place in places]
+        order = sorted(playing, key=lambda index: playing[index].episode)
         actions = np.zeros((0, 0), np.float32)
-        if places:
-            seen = np.stack([moment.observation for moment in moments if moment])
+        if order:
+            seen = np.stack([playing[index].moment.observation for index in order])
             actions = np.asarray(act(seen), np.float32)
-        for place, action in zip(places, actions, strict=True):
-            environments.step(place, action)
-        for _ in places:
+        for index, action in zip(order, actions, strict=True):
+            environments.step(index, action)
+        for _ in order:
             meanwhile()
         decisions = []
-        for place, action in zip(places, actions, strict=True):
-            seat = seats[place]
-            if (moment := receive(place)) is None:
+        for index, action in zip(order, actions, strict=True):
+            played = playing.pop(index)
+            if (moment := environments.receive(index)) is None:
+                lost.append(played.episode)
                 continue
             decisions.append(
                 Decision(
-                    frame=moment.frame,
-                    first_frame=seat.first_frame,
-                    action=action,
-                    task_reward=moment.task_reward,
-                    discount=moment.discount,
-                    is_last=moment.is_last,
-                    episode=seat.episode,
+                    moment.frame,
+                    played.first_frame,
+                    action,
+                    *moment[2:],
+                    episode=played.episode,
                 )
             )
-            seat.moment, seat.first_frame = moment, None
-            if moment.is_last:
-                del seats[place]
+            if not moment.is_last:
+                playing[index] = _Played(played.episode, moment, None)
         yield decisions
 
 
@@ -214,10 +237,7 @@ class FinishedEpisode(NamedTuple):
 
 
 def join(decisions: list[Decision]) -> FinishedEpisode:
-    """Returns the episode that `decisions` make up.
-
-    Args:
-      decisions: all of one episode, in order.
+    """Returns the episode that `decisions`, all of one episode in order, make up.
 
     Raises:
       ValueError: they do not start at a reset, or do not reach the end.

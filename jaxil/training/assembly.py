@@ -148,9 +148,7 @@ def environment_with_seed(config: Config, seed: int) -> PixelEnvironment:
     return make_environment(config.task, seed=seed, **_environment_settings(config))
 
 
-def training_pool(
-    config: Config, environment: PixelEnvironment, say: Callable[[str], None]
-) -> Pool | None:
+def training_pool(config: Config, say: Callable[[str], None]) -> Pool | None:
     """Returns processes that gather experience side by side; None for a single one.
 
     Their environments have one seed: an episode's number alone fixes its start,
@@ -158,7 +156,6 @@ def training_pool(
 
     Args:
       config: checked.
-      environment: such as the processes make; what it shows is not kept.
       say: takes a line for people.
     """
     if config.num_environments == 1 or config.method == "bc":  # which plays nothing
@@ -170,8 +167,6 @@ def training_pool(
     return Pool(
         make,
         config.num_environments,
-        observation=environment.reset(episode=0).observation,
-        frame=environment.single_observation(),
         say=say,
     )
 

@@ -331,7 +331,7 @@ def test_a_file_that_cannot_be_opened(tmp_path, folder):
 
 
 def test_members_that_would_fill_the_memory_are_not_unpacked(path, monkeypatch):
-    monkeypatch.setattr(archive, "MAX_MEMBER_BYTES", 300)
+    monkeypatch.setattr(archive, "MAX_BYTES", 300)
     with pytest.raises(DemonstrationError, match=r"qpos of .* more than the 300"):
         states.read_states(path)
 
