@@ -37,7 +37,7 @@ class Environment(Protocol):
         ...
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
-        """Applies an action; the discount stays 1 where a time limit ends the episode."""
+        """Applies an action; a time limit ends an episode with a discount of 1."""
         ...
 
     def single_observation(self) -> np.ndarray:

@@ -59,8 +59,8 @@ class Pool:
         """Starts the processes without waiting for them.
 
         Args:
-          make: makes an `interaction.Environment`. It is pickled by name, and the processes import
-            what its module imports.
+          make: makes an `interaction.Environment`. It is pickled by name, and the
+            processes import what its module imports.
           size: number of environments.
           say: takes a line for people when a process is replaced.
           step_seconds: that a reset or a step may take.
@@ -85,7 +85,7 @@ class Pool:
         return [worker.process.pid or 0 for _, worker in sorted(self._workers.items())]
 
     def reset(self, index: int, episode: int) -> None:
-        """Sends an environment to the start of an episode, in a new process if needed."""
+        """Sends an environment to an episode's start, in a new process if needed."""
         if index not in self._workers:
             self._say(
                 f"environment {index} {self._reasons[index]}: a new process replaces "

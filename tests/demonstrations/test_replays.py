@@ -244,9 +244,9 @@ def test_files_that_break_the_rules_are_refused(path, name, in_folder):
 
 
 def test_an_array_larger_than_may_be_read(path):
-    # 6 pictures of 8 x 8 pixels, after a header of 128 bytes; and 462 bytes beside them.
+    # 6 pictures of 8 x 8 pixels, after a header of 128 bytes; and 462 bytes more.
     assert len(read(path, max_bytes=6 * 192 + 128 + 462)) == 1
-    with pytest.raises(FormatError, match="1742 bytes in all .* more than the 1741"):
+    with pytest.raises(FormatError, match=r"1742 bytes in all .* more than the 1741"):
         read(path, max_bytes=1741)
     with pytest.raises(
         FormatError, match="image of 1280 bytes, more than the 1279 that"
