@@ -1,4 +1,4 @@
-"""Searches the gains of a swing-up law by the return that they will bring."""
+"""Searches the gains of a swing-up law for the highest predicted return."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ from studio import ACTION_REPEAT
 
 _ELITE = 10  # gains that are varied in each round
 _VARIATION = 0.2  # relative, standard deviation
-# Smallest and largest of each gain; those of one sign are drawn log-uniformly.
+# Smallest and largest of each gain; those of one sign are sampled log-uniformly.
 GAINS = {
     "pump": (0.5, 4.0),  # torque per joule that is missing
     "pump_speed": (0.2, 5.0),  # seconds: how soon the elbow's speed counts as full
@@ -22,31 +22,19 @@ GAINS = {
 
 
 class Effort(NamedTuple):
-    """How much one search tries.
+    """How much one search tries."""
 
-    Attributes:
-      draws: gains drawn afresh, in the first round.
-      variations: gains varied from the best so far, in each round.
-      rounds: at least 1.
-      exact: how many of a round, the best by a quick prediction, are predicted again.
-    """
-
-    draws: int
-    variations: int
-    rounds: int
-    exact: int
+    draws: int  # new gains, in the first round
+    variations: int  # of the best gains so far, in each round
+    rounds: int  # at least 1
+    exact: int  # the best of a round by a quick prediction, which are predicted again
 
 
 def control(arm: Arm, state: tuple, gains: np.ndarray) -> np.ndarray:
-    """Returns actions in [-1, 1]. Shape [N].
+    """Returns actions [N] in [-1, 1], by gains [8, N] in the order of `GAINS`.
 
-    Far from the top the elbow's torque adds the energy that is missing, and bends the
-    elbow after the shoulder's movement; near it the regulator takes over.
-
-    Args:
-      arm: the model.
-      state: see `Arm`.
-      gains: Shape [8, N], in the order of `GAINS`.
+    Far from the top the elbow's torque adds the missing energy, and bends the elbow
+    after the shoulder's movement; near it the regulator takes over.
 
     Source: Spong 1995, "The swing up control problem for the acrobot", for the energy
     and the arctangent; sway and the limits of the catch are ours.
@@ -68,15 +56,15 @@ def control(arm: Arm, state: tuple, gains: np.ndarray) -> np.ndarray:
 def predict(
     arm: Arm, state: np.ndarray, gains: np.ndarray, num_steps: int, *, exact: bool
 ) -> np.ndarray:
-    """Returns the return of each column of gains from one state. Shape [N].
+    """Returns the return [N] of each column of gains [8, N] from one state [4].
 
     Args:
       arm: the model.
-      state: Shape [4].
-      gains: Shape [8, N].
-      num_steps: decisions that are left.
+      state: where all start.
+      gains: see `control`.
+      num_steps: agent steps that are left.
       exact: as the environment would, with actions rounded to float32; else in float32
-        and one time step per decision, four times as fast.
+        with one time step per agent step, four times as fast.
     """
     dtype = np.float64 if exact else np.float32
     gains = gains.astype(dtype)
@@ -99,20 +87,14 @@ def search(
     effort: Effort,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, float]:
-    """Returns the best gains found, [8], and the return that they will bring.
+    """Returns the best gains found, [8], and their predicted return.
 
-    Args:
-      arm: the model.
-      state: Shape [4].
-      held: gains in use, which only better ones replace. Shape [8], or None.
-      num_steps: decisions that are left.
-      effort: how much to try.
-      rng: source of the draws.
+    `held` are gains in use, which only better ones replace, [8]; others as `predict`.
     """
     best = np.zeros((len(GAINS), 0)) if held is None else held[:, None]
     returns = np.zeros(0)
     for number in range(effort.rounds):
-        tried = _draw(0 if number else effort.draws, rng)
+        tried = _sample(0 if number else effort.draws, rng)
         if best.size:
             parents = best[:, rng.integers(best.shape[1], size=effort.variations)]
             varied = parents * np.exp(_VARIATION * rng.normal(size=parents.shape))
@@ -126,7 +108,7 @@ def search(
     return best[:, 0], float(returns[0])
 
 
-def _draw(number: int, rng: np.random.Generator) -> np.ndarray:
+def _sample(number: int, rng: np.random.Generator) -> np.ndarray:
     rows = [
         rng.uniform(low, high, number)
         if low < 0
