@@ -56,7 +56,7 @@ def _record(values: flags.FlagValues) -> None:
     """Records the best of several policies."""
     import numpy as np
 
-    from jaxil.demonstrations import recording, states
+    from jaxil.demonstrations import playing, states
     from jaxil.environments.evaluation import evaluate
     from jaxil.training import assembly, trained
 
@@ -81,7 +81,7 @@ def _record(values: flags.FlagValues) -> None:
         )
     best = runs[int(np.argmax(means))]
     environment = assembly.environment_with_seed(best.config, _SEED)
-    arrays = recording.play(
+    arrays = playing.play(
         environment, lambda _: lambda _, seen: best.act(seen), values.num_episodes
     )
     metadata = states.new_metadata(

@@ -52,8 +52,8 @@ def warn_of_pixels(
     if speed is not None and abs(speed / wanted - 1.0) > _RATE_TOLERANCE:
         messages.append(
             f"{path} has {speed:.3g} frames per second, and the agent makes "
-            f"{wanted:.3g} steps: multiply demonstrations.frame_skip by about "
-            f"{speed / wanted:.3g}."
+            f"{wanted:.3g} steps: about {speed / wanted:.3g} frames make one step. "
+            "Adjust demonstrations.frame_skip or action_repeat."
         )
     messages += [f"{path}: {note}" for note in metadata["notes"]]
     for message in messages:

@@ -4,7 +4,6 @@ import concurrent.futures
 import contextlib
 import functools
 import hashlib
-import itertools
 import json
 import logging
 import multiprocessing
@@ -12,7 +11,6 @@ import os
 import pathlib
 import sys
 import threading
-import time
 import types
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -28,8 +26,8 @@ from jaxil.machine.cache import cache_folder
 # Part of each key: raise it when rendering changes in a way that the key cannot see.
 _CACHE_VERSION = 2
 _MAX_PROCESSES = 8  # some 250 MB each
-_WORTH_SECONDS = 5.0  # less is rendered before another process has gained anything
-_NUM_TIMED = 4  # images, after the first one, which takes longer
+# Some seconds of software rendering: less is done before another process has started.
+_WORTH_PIXELS = 2_000_000
 _SILENCE_SECONDS = 1800.0  # without a finished episode, until they are given up
 _SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer")
 
@@ -125,14 +123,9 @@ def observe_episodes(
 
         if processes is None:
             processes = 1
-            if len(missing) > 1 and observation == "pixels":
-                index, each = next(iter(missing.items()))
-                seconds = _image_seconds(environment, first_episode + index, each)
-                processes = how_many(
-                    len(missing),
-                    seconds=seconds * len(missing) * length,
-                    gl_name=environment.renderer.gl_name(),
-                )
+            if observation == "pixels" and missing:
+                num_pixels = len(missing) * length * image_size**2
+                processes = how_many(num_pixels, environment.renderer.gl_name())
         if processes > 1 and len(missing) > 1:
             rendered = _render_together(
                 min(processes, len(missing)),
@@ -154,30 +147,19 @@ def observe_episodes(
     return observed
 
 
-def how_many(num_episodes: int, *, seconds: float, gl_name: str) -> int:
+def how_many(num_pixels: int, gl_name: str) -> int:
     """Returns how many processes should render; 1 where more don't pay.
 
     Args:
-      num_episodes: to be rendered, each by one process.
-      seconds: that one process would take.
+      num_pixels: of all images.
       gl_name: what renders, see `Renderer.gl_name`.
     """
     # GPUs are fast enough alone, and EGL contexts of several processes at once have
     # been seen to hang there.
     is_software = any(name in gl_name.lower() for name in _SOFTWARE)
-    if not is_software or seconds < _WORTH_SECONDS:
+    if not is_software or num_pixels < _WORTH_PIXELS:
         return 1
-    cores = len(os.sched_getaffinity(0))
-    return max(min(cores, num_episodes, _MAX_PROCESSES), 1)
-
-
-def _image_seconds(environment: PixelEnvironment, number: int, states: States) -> float:
-    """Returns how long it takes to render one image of an episode."""
-    images = _images(environment, number, states)
-    next(images)
-    began = time.perf_counter()
-    num_timed = sum(1 for _ in itertools.islice(images, _NUM_TIMED))
-    return (time.perf_counter() - began) / max(num_timed, 1)
+    return min(len(os.sched_getaffinity(0)), _MAX_PROCESSES)
 
 
 def _images(

@@ -45,7 +45,7 @@ class Renderer:
             size, averaged over 2x2 pixels.
 
         Raises:
-          ValueError: unknown quality, no such camera, or a size below one.
+          ValueError: unknown quality, or a size below one.
         """
         if render_quality not in RENDER_QUALITIES:
             raise ValueError(
@@ -54,12 +54,6 @@ class Renderer:
             )
         if image_size < 1:
             raise ValueError(f"image_size={image_size} must be at least 1 pixel.")
-        num_cameras = int(physics.model.ncam)
-        if not 0 <= camera < num_cameras:
-            raise ValueError(
-                f"camera={camera} does not exist: the model has {num_cameras}, "
-                f"numbered from 0."
-            )
         self._physics, self._open_camera = physics, open_camera
         self.image_size, self._camera_index = image_size, camera
         self._flags = None if render_quality == "paper" else _FAST_FLAGS

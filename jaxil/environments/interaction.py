@@ -1,6 +1,5 @@
 """The agent and its environment, or several of them, one decision at a time."""
 
-import dataclasses
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -122,35 +121,8 @@ class Moment(NamedTuple):
     is_last: bool
 
 
-class Environments(Protocol):
-    """Several environments, by index, that work at the same time; see `pool.Pool`."""
-
-    size: int
-
-    def reset(self, index: int, episode: int, /) -> None:
-        """Sends an environment to the start of an episode."""
-        ...
-
-    def step(self, index: int, action: np.ndarray, /) -> None:
-        """Sends it an action."""
-        ...
-
-    def receive(self, index: int, /) -> Moment | None:
-        """Waits for the outcome; None if it was lost, and the episode with it."""
-        ...
-
-
-@dataclasses.dataclass
-class _Played:
-    """An episode under way: what it shows now, and at its start the first frame."""
-
-    episode: int
-    moment: Moment
-    first_frame: np.ndarray | None
-
-
 def interact_together(
-    environments: Environments,
+    environments: Any,
     act: ActTogether,
     *,
     first_episode: int,
@@ -164,7 +136,8 @@ def interact_together(
     are sorted by the episodes' numbers, and empty if nothing plays.
 
     Args:
-      environments: at least one.
+      environments: a `pool.Pool`, or anything with its `size`, `reset`, `step` and
+        `receive`.
       act: the policy; its rows are sorted as the round is.
       first_episode: number of the first episode.
       begin: asked before each episode whether to play it.
@@ -172,7 +145,8 @@ def interact_together(
         their outcomes are awaited.
     """
     next_episode, lost = first_episode, []
-    playing: dict[int, _Played] = {}  # by index of the environment
+    # What each environment that plays shows: episode, moment, first frame at a reset.
+    playing: dict[int, tuple[int, Moment, np.ndarray | None]] = {}
     while True:
         started = {}
         for index in sorted(set(range(environments.size)) - set(playing)):
@@ -189,12 +163,12 @@ def interact_together(
             if (moment := environments.receive(index)) is None:
                 lost.append(episode)
             else:
-                playing[index] = _Played(episode, moment, moment.frame)
+                playing[index] = (episode, moment, moment.frame)
 
-        order = sorted(playing, key=lambda index: playing[index].episode)
+        order = sorted(playing, key=lambda index: playing[index][0])
         actions = np.zeros((0, 0), np.float32)
         if order:
-            seen = np.stack([playing[index].moment.observation for index in order])
+            seen = np.stack([playing[index][1].observation for index in order])
             actions = np.asarray(act(seen), np.float32)
         for index, action in zip(order, actions, strict=True):
             environments.step(index, action)
@@ -202,21 +176,16 @@ def interact_together(
             meanwhile()
         decisions = []
         for index, action in zip(order, actions, strict=True):
-            played = playing.pop(index)
+            episode, _, first_frame = playing.pop(index)
             if (moment := environments.receive(index)) is None:
-                lost.append(played.episode)
+                lost.append(episode)
                 continue
+            outcome = moment[2:]
             decisions.append(
-                Decision(
-                    moment.frame,
-                    played.first_frame,
-                    action,
-                    *moment[2:],
-                    episode=played.episode,
-                )
+                Decision(moment.frame, first_frame, action, *outcome, episode=episode)
             )
             if not moment.is_last:
-                playing[index] = _Played(played.episode, moment, None)
+                playing[index] = (episode, moment, None)
         yield decisions
 
 

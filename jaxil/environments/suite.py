@@ -78,7 +78,6 @@ def make_environment(
     frame_stack: int = 3,
     render_quality: str = "paper",
     observation: str = "pixels",
-    camera: int | None = None,
 ) -> PixelEnvironment:
     """Makes the environment of `task`.
 
@@ -90,7 +89,6 @@ def make_environment(
       frame_stack: images per observation; without effect on states.
       render_quality: "paper", "fast" or "smooth".
       observation: "pixels" or "state".
-      camera: index of the camera; None takes the field's choice, `camera_of(task)`.
 
     Raises:
       ValueError: an argument is out of range.
@@ -115,7 +113,7 @@ def make_environment(
         suite_environment.physics,
         open_camera=_open_camera,
         image_size=image_size,
-        camera=camera_of(task) if camera is None else camera,
+        camera=camera_of(task),
         render_quality=render_quality,
     )
     return PixelEnvironment(

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import studio
-from cheetah_search import Effort, Judge, Simulator, search
+from cheetah_search import Effort, Judge, Planner, Simulator
 
 TASK = "cheetah_run"
 
@@ -37,6 +37,7 @@ def record(
 
     def prepare(environment: Any) -> Any:
         simulator = Simulator(environment.physics)
+        planner = Planner(simulator, judge, discount, effort)
 
         def begin(episode: int) -> Any:
             rng = np.random.default_rng([studio.SEED, episode])
@@ -45,8 +46,7 @@ def record(
             def decide(step: int, observation: np.ndarray) -> np.ndarray:
                 nonlocal plan
                 del step, observation
-                now = simulator.now()
-                plan = search(simulator, judge, now, plan, effort, discount, rng)
+                plan = planner.search(simulator.now(), plan, rng)
                 return plan[0]
 
             return decide

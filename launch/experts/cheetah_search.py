@@ -68,65 +68,65 @@ class Simulator:
         return np.concatenate(parts, axis=-1).astype(np.float32)
 
 
-def follow(
-    simulator: Simulator, judge: Judge, state: np.ndarray, horizon: int
-) -> np.ndarray:
-    """Returns what the policy would do from a state on, shape [H, A]."""
-    actions = []
-    for _ in range(horizon):
-        action = judge(simulator.observe(state)[None])[0]
-        state = simulator.run(state, action[None])[0][0, -1]
-        actions.append(action[0])
-    return np.stack(actions)
+class Planner(NamedTuple):
+    """Improves on a policy by trying sequences of actions.
 
-
-def score(
-    simulator: Simulator,
-    judge: Judge,
-    state: np.ndarray,
-    actions: np.ndarray,
-    discount: float,
-) -> np.ndarray:
-    """Returns the predicted return [N] of sequences of actions [N, H, A].
-
-    sum_{t<H} gamma^t r_t + gamma^H min_k Q_k(s_H, pi(s_H)), where gamma is the discount
+    Attributes:
+      simulator: what they are tried in.
+      judge: policy and values.
+      discount: gamma.
+      effort: how much is tried.
     """
-    states, rewards = simulator.run(state, actions)
-    horizon = actions.shape[1]
-    values = judge(simulator.observe(states[:, -1]))[1]
-    return rewards @ discount ** np.arange(horizon) + discount**horizon * values
 
+    simulator: Simulator
+    judge: Judge
+    discount: float
+    effort: Effort
 
-def search(
-    simulator: Simulator,
-    judge: Judge,
-    state: np.ndarray,
-    plan: np.ndarray | None,
-    effort: Effort,
-    discount: float,
-    rng: np.random.Generator,
-) -> np.ndarray:
-    """Returns a sequence of actions [H, A] that is better than the policy's.
+    def follow(self, state: np.ndarray) -> np.ndarray:
+        """Returns what the policy would do from a state on, shape [H, A]."""
+        actions = []
+        for _ in range(self.effort.horizon):
+            action = self.judge(self.simulator.observe(state)[None])[0]
+            state = self.simulator.run(state, action[None])[0][0, -1]
+            actions.append(action[0])
+        return np.stack(actions)
 
-    The cross-entropy method, weighted as in MPPI: each round samples around the
-    weighted mean of the round before; the policy's own sequence is always a candidate.
-    `plan` is the result of the decision before; None at an episode's start.
-    """
-    usual = follow(simulator, judge, state, effort.horizon)
-    mean = usual if plan is None else np.concatenate([plan[1:], usual[-1:]])
-    spread = np.full(mean.shape, effort.spread)
-    for _ in range(effort.rounds):
-        noise = rng.standard_normal((effort.candidates, *mean.shape))
-        candidates = mean + spread * noise
-        few = effort.candidates // 4
-        candidates[:few] = usual + effort.spread * noise[:few]
-        candidates[0], candidates[1] = usual, mean
-        candidates = np.clip(candidates, -1.0, 1.0)
-        scores = score(simulator, judge, state, candidates, discount)
-        best = np.argsort(-scores)[: effort.elites]
-        weights = np.exp((scores[best] - scores[best[0]]) / effort.temperature)
-        weights = (weights / weights.sum())[:, None, None]
-        mean = np.sum(weights * candidates[best], axis=0)
-        variance = np.sum(weights * np.square(candidates[best] - mean), axis=0)
-        spread = np.clip(np.sqrt(variance), 0.05, effort.spread)
-    return mean
+    def score(self, state: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """Returns the predicted return [N] of sequences of actions [N, H, A].
+
+        sum_{t<H} gamma^t r_t + gamma^H min_k Q_k(s_H, pi(s_H))
+        """
+        states, rewards = self.simulator.run(state, actions)
+        gamma, horizon = self.discount, actions.shape[1]
+        values = self.judge(self.simulator.observe(states[:, -1]))[1]
+        return rewards @ gamma ** np.arange(horizon) + gamma**horizon * values
+
+    def search(
+        self, state: np.ndarray, plan: np.ndarray | None, rng: np.random.Generator
+    ) -> np.ndarray:
+        """Returns a sequence of actions [H, A] that is better than the policy's.
+
+        The cross-entropy method, weighted as in MPPI: each round samples around the
+        weighted mean of the round before; the policy's own sequence is always a
+        candidate. `plan` is the last decision's result; None at an episode's start.
+        """
+        effort = self.effort
+        usual = self.follow(state)
+        mean = usual if plan is None else np.concatenate([plan[1:], usual[-1:]])
+        spread = np.full(mean.shape, effort.spread)
+        for _ in range(effort.rounds):
+            noise = rng.standard_normal((effort.candidates, *mean.shape))
+            candidates = mean + spread * noise
+            few = effort.candidates // 4
+            candidates[:few] = usual + effort.spread * noise[:few]
+            candidates[0], candidates[1] = usual, mean
+            candidates = np.clip(candidates, -1.0, 1.0)
+            scores = self.score(state, candidates)
+            best = np.argsort(-scores)[: effort.elites]
+            weights = np.exp((scores[best] - scores[best[0]]) / effort.temperature)
+            weights = (weights / weights.sum())[:, None, None]
+            mean = np.sum(weights * candidates[best], axis=0)
+            variance = np.sum(weights * np.square(candidates[best] - mean), axis=0)
+            spread = np.clip(np.sqrt(variance), 0.05, effort.spread)
+        return mean

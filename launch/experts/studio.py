@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any, NoReturn
 
 from jaxil.command import UsageError
-from jaxil.demonstrations import recording, states
+from jaxil.demonstrations import playing, states
 from jaxil.environments import suite
 from jaxil.machine import startup
 
@@ -19,7 +19,7 @@ _MAX_EPISODES = 10_000
 
 # Environment -> episode -> its controller, whose randomness may depend on the episode's
 # number alone.
-Prepare = Callable[[Any], Callable[[int], recording.Decide]]
+Prepare = Callable[[Any], Callable[[int], playing.Decide]]
 
 
 def record(
@@ -40,7 +40,7 @@ def record(
         task, seed=SEED, action_repeat=ACTION_REPEAT, observation="state"
     ) as environment:
         begin = prepare(environment)
-        arrays = recording.play(environment, begin, num_episodes, finished)
+        arrays = playing.play(environment, begin, num_episodes, finished)
     minutes = (time.process_time() - began_cpu) / 60
     metadata = states.new_metadata(
         task=task,

@@ -212,41 +212,34 @@ def is_there(pid):
 
 
 @pytest.mark.parametrize(
-    ("cores", "gl_name", "seconds", "expected"),
+    ("cores", "gl_name", "num_pixels", "expected"),
     [
-        (2, "llvmpipe (LLVM 15.0.6, 256 bits)", 100.0, 2),
-        (64, "llvmpipe (LLVM 15.0.6, 256 bits)", 100.0, 8),
-        (64, "softpipe", 100.0, 8),
-        (1, "softpipe", 100.0, 1),
-        (2, "softpipe", 1.0, 1),
-        (64, "NVIDIA H100 80GB HBM3/PCIe/SSE2", 100.0, 1),
+        (2, "llvmpipe (LLVM 15.0.6, 256 bits)", 10**8, 2),
+        (64, "llvmpipe (LLVM 15.0.6, 256 bits)", 10**8, 8),
+        (64, "softpipe", 10**8, 8),
+        (1, "softpipe", 10**8, 1),
+        (2, "softpipe", 10**5, 1),
+        (64, "NVIDIA H100 80GB HBM3/PCIe/SSE2", 10**8, 1),
     ],
 )
-def test_how_many_processes_pay(cores, gl_name, seconds, expected, monkeypatch):
+def test_how_many_processes_pay(cores, gl_name, num_pixels, expected, monkeypatch):
     monkeypatch.setattr(rendering.os, "sched_getaffinity", lambda _: set(range(cores)))
-    assert rendering.how_many(10, seconds=seconds, gl_name=gl_name) == expected
-    fewer = min(expected, 3)
-    assert rendering.how_many(3, seconds=seconds, gl_name=gl_name) == fewer
+    assert rendering.how_many(num_pixels, gl_name) == expected
 
 
 @pytest.mark.parametrize("pays", [True, False])
 def test_processes_are_started_where_they_pay(pays, alone, monkeypatch):
-    asked, started = [], []
+    started = []
     real = rendering._render_together
-
-    def how_many(num_episodes, *, seconds, gl_name):
-        asked.append((num_episodes, gl_name))
-        assert 0 < seconds < np.inf
-        return 2 if pays else 1
 
     def render_together(*values):
         started.append(values[0])
         return real(*values)
 
-    monkeypatch.setattr(rendering, "how_many", how_many)
     monkeypatch.setattr(rendering, "_render_together", render_together)
+    monkeypatch.setattr(rendering, "_SOFTWARE", ("",))  # every renderer
+    monkeypatch.setattr(rendering.os, "sched_getaffinity", lambda _: {0, 1})
+    num_pixels = TOTAL * SIZE**2
+    monkeypatch.setattr(rendering, "_WORTH_PIXELS", num_pixels + (not pays))
     np.testing.assert_array_equal(observe(processes=None), alone[0])
-    ((num_episodes, gl_name),) = asked
-    assert num_episodes == EPISODES
-    assert gl_name
     assert started == [2] * pays

@@ -285,7 +285,6 @@ def test_cameras_are_those_of_the_field():
         ({"frame_stack": 0}, "frame_stack=0 must be at least 1"),
         ({"seed": -1}, "seed=-1 must be at least 0"),
         ({"observation": "sound"}, "pixels, state"),
-        ({"camera": 9}, "camera=9 does not exist"),
     ],
 )
 def test_faults_name_value_and_rule(changes, message):
