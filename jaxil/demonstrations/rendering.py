@@ -12,7 +12,7 @@ import pathlib
 import sys
 import threading
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -121,11 +121,11 @@ def observe_episodes(
             if paths:
                 _write_cached(paths[index], observed[index])
 
-        if processes is None:
+        if observation != "pixels":
             processes = 1
-            if observation == "pixels" and missing:
-                num_pixels = len(missing) * length * image_size**2
-                processes = how_many(num_pixels, environment.renderer.gl_name())
+        elif processes is None:
+            num_pixels = len(missing) * length * image_size**2
+            processes = how_many(num_pixels, environment.renderer.gl_name())
         if processes > 1 and len(missing) > 1:
             rendered = _render_together(
                 min(processes, len(missing)),
@@ -177,7 +177,7 @@ def _images(
 
 def _render_together(
     processes: int, episodes: dict[int, States], settings: dict[str, Any], gl_name: str
-) -> Iterator[tuple[int, np.ndarray]]:
+) -> Generator[tuple[int, np.ndarray], None, None]:
     """Yields episodes' numbers and images in any order, until one fails.
 
     A software renderer hardly uses more than one core for a small image, so processes

@@ -138,7 +138,11 @@ def test_processes_that_cannot_render_are_done_without(
     else:
         real = rendering._render_together
         monkeypatch.setattr(
-            rendering, "_render_together", lambda *values: real(*values[:3], "a GPU")
+            rendering,
+            "_render_together",
+            lambda processes, episodes, settings, _: real(
+                processes, episodes, settings, "a GPU"
+            ),
         )
     np.testing.assert_array_equal(observe(processes=2), alone[0])
     said = {"another renderer": "not with a GPU", "no process": "no more processes"}
@@ -148,7 +152,7 @@ def test_processes_that_cannot_render_are_done_without(
 
 def test_states_of_another_model_are_refused():
     states = {**STATES, "qpos": STATES["qpos"][..., :-1]}
-    for processes in (1, 2, None):
+    for processes in (1, None):
         with pytest.raises(ValueError, match="qpos has shape"):
             observe(processes=processes, states=states)
 
