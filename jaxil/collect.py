@@ -16,6 +16,7 @@ folders of DrQ-v2 or V-D4RL episodes, videos, Minari and LeRobot v3 datasets.
 """
 
 import contextlib
+import functools
 import pathlib
 import sys
 import tempfile
@@ -29,7 +30,7 @@ from jaxil.errors import UsageError
 _NUM_EVAL_EPISODES = 10
 # The recording environment's seed: shared by no training and no evaluation.
 _SEED = 777
-# Height and width of what is drawn from states, unless --image_size says otherwise.
+# Height and width of images rendered from states, unless --image_size is given.
 _INSPECTED_SIZE, _CONVERTED_SIZE = 160, 84
 _JOBS = ("workdirs", "inspect", "convert")
 
@@ -43,17 +44,7 @@ def main(argv: list[str]) -> None:
         names = ", ".join(f"--{name}" for name in _JOBS)
         given = ", ".join(f"--{name}" for name in jobs) or "none"
         faults.append(f"exactly one of {names} is needed, and given: {given}")
-    if "inspect" not in jobs and values.output is None:
-        faults.append("--output is missing: name the file to write, NAME.npz")
-    if values.output is not None and pathlib.Path(values.output).is_dir():
-        if "inspect" not in jobs:
-            faults.append(
-                f"--output={values.output} is a folder: name a file, NAME.npz"
-            )
-    elif "inspect" in jobs and values.output is not None:
-        faults.append(f"--output={values.output} must be a folder that exists")
-    elif values.output is not None:
-        faults += _output_faults(values)
+    faults += _output_faults(values)
     if faults:
         raise UsageError(faults)
     from jaxil.machine import startup
@@ -66,9 +57,9 @@ def _record(values: flags.FlagValues) -> None:
     """Records the best of several policies."""
     import numpy as np
 
-    from jaxil.demonstrations import states
+    from jaxil.demonstrations import playing, states
     from jaxil.environments.evaluation import evaluate
-    from jaxil.training import recording, trained
+    from jaxil.training import assembly, trained
 
     runs = [trained.load(pathlib.Path(folder)) for folder in values.workdirs]
     tasks = sorted({run.config.task for run in runs})
@@ -89,28 +80,41 @@ def _record(values: flags.FlagValues) -> None:
             f"{run.seconds / 60:>9.0f}  {folder}",
             flush=True,
         )
-    best = int(np.argmax(means))
-    stored = recording.record(runs[best], num_episodes=values.num_episodes, seed=_SEED)
+    best = runs[int(np.argmax(means))]
+    environment = assembly.environment_with_seed(best.config, _SEED)
+    arrays = playing.play(
+        environment, lambda _: lambda _, seen: best.act(seen), values.num_episodes
+    )
+    metadata = states.new_metadata(
+        task=best.config.task,
+        action_repeat=best.config.action_repeat,
+        seed=_SEED,
+        first_episode=0,
+        expert=f"{best.description()}; mean action, no noise",
+        rewards=arrays["rewards"],
+    )
+    output = pathlib.Path(values.output)
     try:
-        states.write_states(values.output, stored)
+        states.write_states(
+            output, states.StateDemonstrations(**arrays, metadata=metadata)
+        )
     except (OSError, states.DemonstrationError) as error:
-        raise UsageError(f"--output={values.output}: {error}") from error
-    returns = stored.rewards.sum(axis=1)
-    size = pathlib.Path(values.output).stat().st_size / 1e6
+        raise UsageError(f"--output={output}: {error}") from error
+    returns = arrays["rewards"].sum(axis=1)
     print(
-        f"{values.output}: {len(returns)} episodes of {values.workdirs[best]}, return "
-        f"mean {returns.mean():.1f}, minimum {returns.min():.1f}, maximum "
-        f"{returns.max():.1f}, {size:.2f} MB"
+        f"{output}: {len(returns)} episodes of {values.workdirs[int(np.argmax(means))]}"
+        f", return mean {returns.mean():.1f}, minimum {returns.min():.1f}, maximum "
+        f"{returns.max():.1f}, {output.stat().st_size / 1e6:.2f} MB"
     )
 
 
 def _inspect(values: flags.FlagValues) -> None:
-    """Prints a summary; writes a contact sheet and a video."""
+    """Prints a table; writes a contact sheet and a video."""
     from jaxil.demonstrations import inspection
     from jaxil.files.video import write_video
 
     path = pathlib.Path(values.inspect)
-    with _told(path, f"--inspect={path}"):
+    with _reported(path, f"--inspect={path}"):
         seen = inspection.inspect(
             path,
             image_size=values.image_size or _INSPECTED_SIZE,
@@ -118,7 +122,7 @@ def _inspect(values: flags.FlagValues) -> None:
             max_bytes=_max_bytes(),
         )
     name = path.resolve().stem
-    # Never the name of what is shown, which may be a video in this very folder.
+    # Never the name of the input, which may be a video in this very folder.
     folder = pathlib.Path(values.output or ".")
     sheet, video = folder / f"{name}_sheet.png", folder / f"{name}_episode0.mp4"
     try:
@@ -139,7 +143,7 @@ def _convert(values: flags.FlagValues) -> None:
     from jaxil.demonstrations.readers import own
 
     path, output = pathlib.Path(values.convert), pathlib.Path(values.output)
-    with _told(path, f"--convert={path} --output={output}"):
+    with _reported(path, f"--convert={path} --output={output}"):
         if states.recognises(path):
             recording = inspection.render_recording(
                 path,
@@ -153,24 +157,22 @@ def _convert(values: flags.FlagValues) -> None:
             if values.image_size is not None:
                 recording = foreign.of_size(recording, values.image_size)
         own.write_pixels(output, recording, origin=f"{recording.kind}, {path.name}")
-    size = output.stat().st_size / 1e6
     print(
         f"{output}: {recording.num_episodes} episodes of {recording.kind}, "
-        f"{size:.2f} MB"
+        f"{output.stat().st_size / 1e6:.2f} MB"
     )
 
 
 @contextlib.contextmanager
-def _told(path: pathlib.Path, flags_given: str) -> Iterator[None]:
+def _reported(path: pathlib.Path, flags_given: str) -> Iterator[None]:
     """Turns what may be wrong with a user's file into one message."""
-    from jaxil.demonstrations.readers.recording import FormatError
     from jaxil.demonstrations.states import DemonstrationError
 
     try:
         yield
     except DemonstrationError as error:
         raise UsageError(str(error)) from error
-    except FormatError as error:
+    except ValueError as error:  # a FormatError among them
         raise UsageError(f"{path} {error}.") from error
     except OSError as error:
         raise UsageError(
@@ -179,8 +181,18 @@ def _told(path: pathlib.Path, flags_given: str) -> Iterator[None]:
 
 
 def _output_faults(values: flags.FlagValues) -> list[str]:
-    """Says why the output can't be written, before minutes of work end at it."""
+    """Returns why the output cannot be written, before minutes of work are lost."""
+    if values.output is None:
+        if values.inspect:
+            return []
+        return ["--output is missing: name the file to write, NAME.npz"]
     output = pathlib.Path(values.output)
+    if values.inspect:
+        if output.is_dir():
+            return []
+        return [f"--output={output} must be a folder that exists"]
+    if output.is_dir():
+        return [f"--output={output} is a folder: name a file, NAME.npz"]
     if values.convert and output.resolve() == pathlib.Path(values.convert).resolve():
         return [f"--output={output} is the file to convert: name another one"]
     folder = next(parent for parent in output.absolute().parents if parent.exists())
@@ -189,8 +201,8 @@ def _output_faults(values: flags.FlagValues) -> list[str]:
             return []
     except OSError as error:
         return [
-            f"--output={output} can't be written ({error.strerror or error}): name "
-            "a file in a folder of yours"
+            f"--output={output} cannot be written ({error.strerror or error}): name "
+            "a file in another folder"
         ]
 
 
@@ -198,12 +210,12 @@ def _named_output(argv: list[str]) -> list[str]:
     """Lets people write `--convert IN OUT` for `--convert=IN --output=OUT`."""
     if "--convert" not in argv:
         return argv
-    place = argv.index("--convert")
-    words = argv[place + 1 : place + 3]
+    index = argv.index("--convert")
+    words = argv[index + 1 : index + 3]
     if len(words) < 2 or any(word.startswith("-") for word in words):
         return argv
     named = [f"--convert={words[0]}", f"--output={words[1]}"]
-    return [*argv[:place], *named, *argv[place + 3 :]]
+    return [*argv[:index], *named, *argv[index + 3 :]]
 
 
 def _max_bytes() -> int:
@@ -214,58 +226,39 @@ def _max_bytes() -> int:
 
 
 def _define(values: flags.FlagValues) -> None:
+    text = functools.partial(flags.DEFINE_string, default=None, flag_values=values)
+    number = functools.partial(flags.DEFINE_integer, flag_values=values)
     flags.DEFINE_list(
         "workdirs",
         [],
         "folders of runs of one task, comma-separated, to record the best of",
         flag_values=values,
     )
-    flags.DEFINE_string(
-        "inspect", None, "file or folder to show, of any format", flag_values=values
-    )
-    flags.DEFINE_string(
+    text("inspect", help="file or folder to show, of any format")
+    text(
         "convert",
-        None,
-        "file or folder of any format to write as pixels; also --convert IN OUT",
-        flag_values=values,
+        help="file or folder of any format to write as pixels; also --convert IN OUT",
     )
-    flags.DEFINE_string(
+    text(
         "output",
-        None,
-        "file to write, NAME.npz; with --inspect the folder for sheet and video",
-        flag_values=values,
+        help="file to write, NAME.npz; with --inspect the folder for sheet and video",
     )
-    flags.DEFINE_integer(
-        "num_episodes",
-        50,
-        "episodes to record",
-        lower_bound=1,
-        upper_bound=10_000,
-        flag_values=values,
-    )
-    flags.DEFINE_integer(
+    number("num_episodes", 50, "episodes to record", 1, 10_000)
+    number(
         "image_size",
         None,
         "height and width for --convert and --inspect; without it pixels keep theirs",
-        lower_bound=8,
-        upper_bound=1024,
-        flag_values=values,
+        8,
+        1024,
     )
     flags.DEFINE_enum(
         "render_quality",
         "paper",
         ["paper", "fast", "smooth"],
-        "how states are drawn by --convert and --inspect",
+        "how --convert and --inspect render states",
         flag_values=values,
     )
-    flags.DEFINE_integer(
-        "frame_skip",
-        1,
-        "--convert keeps every so many-th frame of a file of pixels",
-        lower_bound=1,
-        upper_bound=10_000,
-        flag_values=values,
-    )
+    number("frame_skip", 1, "--convert keeps every N-th frame of pixels", 1, 10_000)
 
 
 if __name__ == "__main__":

@@ -53,6 +53,7 @@ class Counters:
       last_eval_step: agent step of the last evaluation.
       last_checkpoint_step: agent step of the last checkpoint.
       last_refresh_step: agent step of the last recomputation of stored rewards.
+      owes_evaluation: whether an evaluation was due when the run was stopped.
       seconds: wall-clock of the run, earlier processes included.
     """
 
@@ -62,6 +63,7 @@ class Counters:
     last_eval_step: int = 0
     last_checkpoint_step: int = 0
     last_refresh_step: int = 0
+    owes_evaluation: bool = False
     seconds: float = 0.0
 
 
@@ -134,6 +136,8 @@ class Run:
         config, counters, player = self.config, self.counters, self.player
         act = self.stopwatch.timed("update", self.act)
         learn = self.stopwatch.timed("update", self.learn)
+        if counters.owes_evaluation:
+            self.evaluate()
         # Collected updates run before a stop: fewer at once would act differently.
         while not self.stop_asked or self.updates.is_pending:
             if player is not None:
@@ -328,6 +332,7 @@ class Run:
             is_last=self.frame >= self.config.total_frames,
             stop_asked=lambda: self.stop_asked,
         )
+        counters.owes_evaluation = result is None
         if result is None:  # stopped: the resumed run plays it
             return
         counters.num_evals += 1

@@ -91,10 +91,9 @@ def test_the_sheet_shows_an_episode_from_first_to_last_frame():
     # Frame t is of brightness 10 t: eight pictures of fifteen frames, evenly spaced.
     brightness = np.arange(15, dtype=np.uint8) * 10
     frames = np.broadcast_to(brightness[:, None, None, None], (15, 4, 4, 3))
-    summary = inspection.EpisodeSummary(15, 4, 4, None, None)
-    seen = inspection.Inspection(
-        "x", {}, [summary], [frames[inspection._spaced(15)]], frames, 10.0
-    )
+    summary = inspection.EpisodeSummary(15, "4x4", None, None)
+    pictures = [frames[inspection.spaced(15)]]
+    seen = inspection.Inspection({}, [summary], pictures, frames, 10.0)
     sheet = np.asarray(inspection.contact_sheet(seen))
     row = sheet[-20, :, 0]  # a line through the pictures
     shown = [value for value, _ in itertools.groupby(row.tolist()) if value != 24]
@@ -150,7 +149,7 @@ def test_pixels_keep_their_size_unless_another_is_asked_for(tmp_path):
         (["--convert=a"], "--output is missing"),
         (["--convert=a", "--output=."], "is a folder"),
         (["--convert=a.npz", "--output=./a.npz"], "is the file to convert"),
-        (["--workdirs=a", "--output=/proc/x.npz"], "can't be written"),
+        (["--workdirs=a", "--output=/proc/x.npz"], "cannot be written"),
         (["--inspect=none.npz"], "none.npz cannot be read"),
         (["--inspect=setup.cfg"], "in no format that is read"),
         (["--inspect=setup.cfg", "--output=setup.cfg"], "must be a folder"),

@@ -75,7 +75,7 @@ def test_acrobot_energy_stays_without_friction_and_torque():
 
 
 def test_acrobot_regulator_holds_what_falls_alone(environment):
-    planner = importlib.import_module("acrobot_planner")
+    planner = importlib.import_module("acrobot")
     arm = _arm(environment)
     gains = np.array([[1.0, 1, 0, 1, 0, 1, 1, 30]]).T
     start = tuple(np.array([[0.005], [-0.005], [0.0], [0.0]]))
@@ -88,7 +88,7 @@ def test_acrobot_regulator_holds_what_falls_alone(environment):
 
 
 def test_acrobot_search_never_gives_up_better_gains(environment):
-    planner = importlib.import_module("acrobot_planner")
+    planner = importlib.import_module("acrobot")
     arm = _arm(environment)
     environment.reset(episode=0)
     state, steps = _state(environment), 60
@@ -206,11 +206,11 @@ def test_cheetah_search_beats_the_policy_it_starts_from(cheetah):
 
     effort = module.Effort(horizon=8, candidates=32, rounds=3)
     state, rng = simulator.now(), np.random.default_rng(0)
-    usual = module.follow(simulator, judge, state, effort.horizon)
+    planner = module.Planner(simulator, judge, 0.99, effort)
+    usual = planner.follow(state)
     np.testing.assert_array_equal(usual, np.zeros((8, 6)))
-    plan = module.search(simulator, judge, state, None, effort, 0.99, rng)
-    both = np.stack([usual, plan])
-    idle, found = module.score(simulator, judge, state, both, 0.99)
+    plan = planner.search(state, None, rng)
+    idle, found = planner.score(state, np.stack([usual, plan]))
     assert found > idle + 0.1
     assert np.abs(plan).max() <= 1.0
 
@@ -220,7 +220,7 @@ def test_cheetah_score_by_hand(cheetah):
     values = iter([np.array([3.0])])
     state, actions = simulator.now(), np.zeros((1, 2, 6))
     rewards = simulator.run(state, actions)[1][0]
-    total = module.score(
-        simulator, lambda o: (np.zeros((1, 6)), next(values)), state, actions, 0.5
-    )
+    judge = lambda seen: (np.zeros((1, 6)), next(values))  # noqa: E731
+    planner = module.Planner(simulator, judge, 0.5, module.Effort())
+    total = planner.score(state, actions)
     assert total[0] == pytest.approx(rewards[0] + 0.5 * rewards[1] + 0.25 * 3.0)

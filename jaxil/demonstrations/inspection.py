@@ -1,7 +1,9 @@
-"""What a demonstration file holds, for the eye: a table, a contact sheet, a video."""
+"""Shows a demonstration file as a table, a contact sheet and a video."""
 
+import itertools
 import pathlib
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -12,10 +14,10 @@ from jaxil.environments import suite
 
 NUM_COLUMNS = 8  # pictures of an episode on the sheet
 _NUM_ROWS = 10  # episodes on the sheet
-_LEAST_SIDE = 96  # pixels of a picture on the sheet
+_MIN_SIDE = 96  # pixels of a picture on the sheet
 _MARGIN = 4
 _CAPTION = 16
-_DEFAULT_SPEED = 25.0  # frames per second, where a file doesn't say
+_DEFAULT_SPEED = 25.0  # frames per second, where a file lacks it
 
 
 class EpisodeSummary(NamedTuple):
@@ -23,24 +25,21 @@ class EpisodeSummary(NamedTuple):
 
     Attributes:
       num_frames: N + 1.
-      height: of a frame, in pixels; 0 for states.
-      width: likewise.
+      size: of a frame in pixels, "WxH"; "rendered" for states.
       action_dim: None without actions.
       task_return: None without rewards.
     """
 
     num_frames: int
-    height: int
-    width: int
+    size: str
     action_dim: int | None
     task_return: float | None
 
 
 class Inspection(NamedTuple):
-    """What was seen of a file.
+    """The content of a file.
 
     Attributes:
-      kind: the format, for people.
       facts: label and text of what the file says of itself.
       episodes: one summary each.
       pictures: of up to ten episodes, uint8 [8, H, W, 3] each, evenly spaced in time.
@@ -48,7 +47,6 @@ class Inspection(NamedTuple):
       frames_per_second: of the video.
     """
 
-    kind: str
     facts: dict[str, str]
     episodes: list[EpisodeSummary]
     pictures: list[np.ndarray]
@@ -56,89 +54,111 @@ class Inspection(NamedTuple):
     frames_per_second: float
 
 
-def inspect(
-    path: pathlib.Path, *, image_size: int, render_quality: str, max_bytes: int
-) -> Inspection:
-    """Reads all of a demonstration file, and draws a little of it if it holds states.
+def inspect(path: pathlib.Path, *, max_bytes: int, **view: Any) -> Inspection:
+    """Reads a demonstration file, and renders a part of it if it holds states.
 
     Args:
       path: file or folder of any format in `foreign.FORMATS`.
-      image_size: of pictures drawn from states.
-      render_quality: likewise.
       max_bytes: the largest array that may be unpacked.
+      view: `image_size` and `render_quality` of images rendered from states.
 
     Raises:
       DemonstrationError: a file of states is damaged.
+      ValueError: its states are not those of its task.
       FormatError: another file is, or is of no known format.
-      OSError: it can't be opened.
+      OSError: it cannot be opened.
     """
     if states.recognises(path):
-        return _inspect_states(path, image_size, render_quality)
+        return _inspect_states(path, view)
     recording = foreign.open_recording(path, max_bytes=max_bytes)
     speed = recording.frames_per_second
     summaries, pictures, video = [], [], np.empty((0, 1, 1, 3), np.uint8)
     for episode in recording.episodes:
-        frames = episode.frames
+        frames, actions, rewards = episode
         if len(pictures) < _NUM_ROWS:
-            pictures.append(frames[_spaced(len(frames))].copy())
+            pictures.append(frames[spaced(len(frames))].copy())
         if not summaries:
             video = frames
-        summaries.append(_summary(episode))
+        summaries.append(
+            EpisodeSummary(
+                len(frames),
+                f"{frames.shape[2]}x{frames.shape[1]}",
+                None if actions is None else actions.shape[1],
+                None if rewards is None else float(rewards.sum()),
+            )
+        )
     facts = {
-        "task": recording.task or "not said",
-        "action repeat": str(recording.action_repeat or "not said"),
-        "frames per second": "not said" if speed is None else f"{speed:g}",
+        "format": recording.kind,
+        "task": recording.task or "unknown",
+        "action repeat": str(recording.action_repeat or "unknown"),
+        "frames per second": "unknown" if speed is None else f"{speed:g}",
     }
     for number, note in enumerate(recording.notes, start=1):
         facts[f"note {number}"] = note
+    return Inspection(facts, summaries, pictures, video, speed or _DEFAULT_SPEED)
+
+
+def _inspect_states(path: pathlib.Path, view: dict[str, Any]) -> Inspection:
+    stored = states.read_states(path)
+    metadata = stored.metadata
+    num_episodes, num_steps = stored.rewards.shape
+    versions = ", ".join(f"{k} {v}" for k, v in metadata["versions"].items())
     return Inspection(
-        recording.kind, facts, summaries, pictures, video, speed or _DEFAULT_SPEED
+        facts={
+            "format": "jaxil states",
+            "task": metadata["task"],
+            "action repeat": str(metadata["action_repeat"]),
+            "expert": metadata["expert"],
+            "versions": versions,
+            "size": f"{path.stat().st_size / 1e6:.2f} MB",
+        },
+        episodes=[
+            EpisodeSummary(num_steps + 1, "rendered", stored.actions.shape[2], value)
+            for value in metadata["returns"]
+        ],
+        pictures=[
+            _render(stored, episode, spaced(num_steps + 1), view)
+            for episode in range(min(num_episodes, _NUM_ROWS))
+        ],
+        video=_render(stored, 0, slice(None), view),
+        frames_per_second=_speed(stored),
     )
 
 
-def render_recording(
-    path: pathlib.Path, *, image_size: int, render_quality: str
-) -> Recording:
+def render_recording(path: pathlib.Path, **view: Any) -> Recording:
     """Opens a file of states as if it held the pixels that its task shows.
 
     Args:
       path: the file.
-      image_size: height and width in pixels.
-      render_quality: "paper", "fast" or "smooth".
+      view: `image_size` and `render_quality`.
 
     Raises:
       DemonstrationError: the file is damaged.
+      ValueError: its states are not those of its task.
     """
     stored = states.read_states(path)
-    metadata = stored.metadata
-    repeat = metadata["action_repeat"]
 
-    def episodes():
+    def episodes() -> Iterator[PixelEpisode]:
         for index in range(len(stored.rewards)):
-            frames = _draw(stored, index, slice(None), image_size, render_quality)
+            frames = _render(stored, index, slice(None), view)
             yield PixelEpisode(frames, stored.actions[index], stored.rewards[index])
 
     return Recording(
-        kind=f"jaxil states, drawn at quality {render_quality}",
+        kind=f"jaxil states, rendered at quality {view['render_quality']}",
         num_episodes=len(stored.rewards),
         episodes=episodes(),
-        task=metadata["task"],
-        action_repeat=repeat,
-        frames_per_second=1.0 / suite.decision_seconds(metadata["task"], repeat),
+        task=stored.metadata["task"],
+        action_repeat=stored.metadata["action_repeat"],
+        frames_per_second=_speed(stored),
     )
 
 
 def table(inspection: Inspection) -> str:
-    """Returns the inspection as text of a few lines, one for each episode."""
-    lines = [f"format: {inspection.kind}"]
-    lines += [f"{label}: {text}" for label, text in inspection.facts.items()]
-    returns = [
-        summary.task_return
-        for summary in inspection.episodes
-        if summary.task_return is not None
-    ]
+    """Returns the inspection as text, with one line for each episode."""
+    lines = [f"{label}: {text}" for label, text in inspection.facts.items()]
     lines.append(f"episodes: {len(inspection.episodes)}")
-    if returns:
+    known = [row.task_return for row in inspection.episodes]
+    if returns := [value for value in known if value is not None]:
         lines.append(
             f"return: mean {np.mean(returns):.1f}, minimum {min(returns):.1f}, "
             f"maximum {max(returns):.1f}"
@@ -147,103 +167,61 @@ def table(inspection: Inspection) -> str:
         f"{'episode':>8}{'frames':>8}{'pixels':>12}{'actions':>9}{'return':>10}"
     )
     for index, row in enumerate(inspection.episodes):
-        size = f"{row.width}x{row.height}" if row.height else "drawn"
         actions = "none" if row.action_dim is None else str(row.action_dim)
-        worth = "unknown" if row.task_return is None else f"{row.task_return:.1f}"
-        lines.append(f"{index:>8}{row.num_frames:>8}{size:>12}{actions:>9}{worth:>10}")
+        value = "unknown" if row.task_return is None else f"{row.task_return:.1f}"
+        lines.append(
+            f"{index:>8}{row.num_frames:>8}{row.size:>12}{actions:>9}{value:>10}"
+        )
     return "\n".join(lines)
 
 
 def contact_sheet(inspection: Inspection) -> Image.Image:
     """Returns one row of pictures for each episode, time running to the right."""
     height, width = inspection.pictures[0].shape[1:3]
-    scale = _LEAST_SIDE / min(height, width)
+    scale = _MIN_SIDE / min(height, width)
     cell = (max(1, round(width * scale)), max(1, round(height * scale)))
-    sheet = Image.new(
-        "RGB",
-        (
-            NUM_COLUMNS * (cell[0] + _MARGIN) + _MARGIN,
-            len(inspection.pictures) * (cell[1] + _CAPTION + _MARGIN) + _MARGIN,
-        ),
-        (24, 24, 24),
+    column_width, row_height = cell[0] + _MARGIN, cell[1] + _CAPTION + _MARGIN
+    size = (
+        NUM_COLUMNS * column_width + _MARGIN,
+        len(inspection.pictures) * row_height + _MARGIN,
     )
+    sheet = Image.new("RGB", size, (24, 24, 24))
     draw = ImageDraw.Draw(sheet)
-    for row, (pictures, summary) in enumerate(
-        zip(inspection.pictures, inspection.episodes, strict=False)
-    ):
-        top = _MARGIN + row * (cell[1] + _CAPTION + _MARGIN)
+    for row, pictures in enumerate(inspection.pictures):
+        summary = inspection.episodes[row]
+        top = _MARGIN + row * row_height
         caption = f"episode {row}, {summary.num_frames} frames"
         if summary.task_return is not None:
             caption += f", return {summary.task_return:.0f}"
         draw.text((_MARGIN, top), caption, fill=(235, 235, 235))
-        for column, picture in enumerate(pictures):
+        for left, picture in zip(itertools.count(_MARGIN, column_width), pictures):
             image = Image.fromarray(picture).resize(cell, Image.Resampling.BILINEAR)
-            sheet.paste(image, (_MARGIN + column * (cell[0] + _MARGIN), top + _CAPTION))
+            sheet.paste(image, (left, top + _CAPTION))
     return sheet
 
 
-def _inspect_states(
-    path: pathlib.Path, image_size: int, render_quality: str
-) -> Inspection:
-    stored = states.read_states(path)
+def spaced(num_frames: int) -> np.ndarray:
+    """Returns the indices of 8 evenly spaced frames, the first and last among them."""
+    return np.linspace(0, num_frames - 1, NUM_COLUMNS).round().astype(int)
+
+
+def _speed(stored: states.StateDemonstrations) -> float:
     metadata = stored.metadata
-    num_episodes, num_steps = stored.rewards.shape
-    columns = _spaced(num_steps + 1)
-    rows = range(min(num_episodes, _NUM_ROWS))
-    repeat = metadata["action_repeat"]
-    return Inspection(
-        kind="jaxil states",
-        facts={
-            "task": metadata["task"],
-            "action repeat": str(repeat),
-            "expert": metadata["expert"],
-            "versions": ", ".join(f"{k} {v}" for k, v in metadata["versions"].items()),
-            "size": f"{path.stat().st_size / 1e6:.2f} MB",
-        },
-        episodes=[
-            EpisodeSummary(num_steps + 1, 0, 0, stored.actions.shape[2], value)
-            for value in metadata["returns"]
-        ],
-        pictures=[
-            _draw(stored, row, columns, image_size, render_quality) for row in rows
-        ],
-        video=_draw(stored, 0, slice(None), image_size, render_quality),
-        frames_per_second=1.0 / suite.decision_seconds(metadata["task"], repeat),
-    )
+    return 1.0 / suite.decision_seconds(metadata["task"], metadata["action_repeat"])
 
 
-def _draw(
+def _render(
     stored: states.StateDemonstrations,
     episode: int,
     times: np.ndarray | slice,
-    image_size: int,
-    render_quality: str,
+    view: dict[str, Any],
 ) -> np.ndarray:
     """Returns images [N, S, S, 3] of some moments of an episode."""
     return rendering.observe_episodes(
-        {
-            name: getattr(stored, name)[episode : episode + 1, times]
-            for name in ("qpos", "qvel", "act")
-        },
+        stored.simulator_states(times, slice(episode, episode + 1)),
         task=stored.metadata["task"],
         seed=stored.metadata["seed"],
         first_episode=stored.metadata["first_episode"] + episode,
-        image_size=image_size,
-        render_quality=render_quality,
         cache=False,
+        **view,
     )[0]
-
-
-def _summary(episode: PixelEpisode) -> EpisodeSummary:
-    return EpisodeSummary(
-        num_frames=len(episode.frames),
-        height=episode.frames.shape[1],
-        width=episode.frames.shape[2],
-        action_dim=None if episode.actions is None else episode.actions.shape[1],
-        task_return=None if episode.rewards is None else float(episode.rewards.sum()),
-    )
-
-
-def _spaced(num_frames: int) -> np.ndarray:
-    """Returns the indices of evenly spaced frames, the first and last among them."""
-    return np.linspace(0, num_frames - 1, NUM_COLUMNS).round().astype(int)

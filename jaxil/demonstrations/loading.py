@@ -1,4 +1,4 @@
-"""Demonstrations as the agent would see them, whatever file they come from."""
+"""Demonstrations as the agent would see them, from files of any format."""
 
 import functools
 import os
@@ -28,9 +28,9 @@ class Demonstrations(NamedTuple):
       frames: single images, uint8 [K, N + 1, H, W, 3], or, where the agent observes
         states, float32 [K, N + 1, S]. A shorter episode repeats its last frame.
       num_frames: how many of them are the episode's own. Shape [K].
-      actions: float32 [K, N, A]; only for methods that may see them. None where the
-        file has none.
-      task_rewards: float32 [K, N]; only to be logged. None where the file has none.
+      actions: float32 [K, N, A]; None where the file has none. Only for methods that
+        may see them.
+      task_rewards: float32 [K, N]; None where the file has none. Only for logs.
       metadata: the file's, with `file`, `action_repeat`, and `returns` as served: one
         number for each episode, or none at all.
     """
@@ -59,7 +59,7 @@ def check(
     max_bytes: int = states.MAX_ARRAY_BYTES,
     sees_actions: bool = False,
 ) -> None:
-    """Finds out whether `load` would succeed, without drawing anything.
+    """Finds out whether `load` would succeed, without rendering anything.
 
     Args:
       source: see `load`, as all others.
@@ -70,22 +70,10 @@ def check(
     """
     path = _path_of(source, task)
     if states.recognises(path):
-        _open_states(
-            path,
-            task=task,
-            num_episodes=num_episodes,
-            action_repeat=action_repeat,
-            frame_skip=frame_skip,
-        )
+        _open_states(path, task, num_episodes, action_repeat, frame_skip)
         return
     loaded = _load_pixels(
-        path,
-        task=task,
-        num_episodes=num_episodes,
-        image_size=image_size,
-        observation=observation,
-        frame_skip=frame_skip,
-        max_bytes=max_bytes,
+        path, task, num_episodes, image_size, observation, frame_skip, max_bytes
     )
     if not sees_actions:
         return
@@ -117,37 +105,31 @@ def load(
     cache: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Demonstrations:
-    """Loads demonstrations, those of states as the agent's own environment shows them.
+    """Loads demonstrations; states are rendered by the agent's own environment.
 
     Args:
       source: a file or folder of any format in `foreign.FORMATS`; "" for the states
         that are shipped for the task.
       task: `domain_task`.
       num_episodes: how many, the file's first ones.
-      action_repeat: the agent's; a multiple of a state file's. Of the steps that become
-        one, rewards are summed and the first one's action stands for all.
+      action_repeat: the agent's; a multiple of a state file's. Where several stored
+        steps become one, their rewards are summed and the first action is kept.
       image_size: height and width in pixels.
       render_quality: "paper", "fast" or "smooth".
       observation: "pixels" or "state".
       frame_skip: for files of pixels: every so many-th frame is kept.
       max_bytes: for files of pixels: the memory that they may take.
-      cache: whether to keep drawn images, in `machine.cache.cache_folder()`.
-      progress: called with (images drawn, images in all) when anything is drawn.
+      cache: whether to keep rendered images, in `machine.cache.cache_folder()`.
+      progress: called with (images rendered, images in all) if any have to be.
 
     Raises:
-      DemonstrationError: the file can't be read, is not one of demonstrations, is
+      DemonstrationError: the file cannot be read, is not one of demonstrations, is
         damaged, or is not what was asked for.
     """
     path = _path_of(source, task)
     if not states.recognises(path):
         loaded = _load_pixels(
-            path,
-            task=task,
-            num_episodes=num_episodes,
-            image_size=image_size,
-            observation=observation,
-            frame_skip=frame_skip,
-            max_bytes=max_bytes,
+            path, task, num_episodes, image_size, observation, frame_skip, max_bytes
         )
         mismatch.warn_of_pixels(
             path,
@@ -157,22 +139,17 @@ def load(
             action_repeat=action_repeat,
         )
         return loaded
-    stored, stride = _open_states(
-        path,
-        task=task,
-        num_episodes=num_episodes,
-        action_repeat=action_repeat,
-        frame_skip=frame_skip,
-    )
+    stored, stride = _open_states(path, task, num_episodes, action_repeat, frame_skip)
+    metadata = stored.metadata
+    mismatch.warn_of_versions(path, metadata["versions"])
     num_steps = stored.rewards.shape[1] // stride
-    mismatch.warn_of_versions(path, stored.metadata["versions"])
-    steps = slice(0, num_steps * stride + 1, stride)
+    used = num_steps * stride
     try:
         frames = rendering.observe_episodes(
-            {name: getattr(stored, name)[:, steps] for name in ("qpos", "qvel", "act")},
+            stored.simulator_states(slice(0, used + 1, stride)),
             task=task,
-            seed=stored.metadata["seed"],
-            first_episode=stored.metadata["first_episode"],
+            seed=metadata["seed"],
+            first_episode=metadata["first_episode"],
             image_size=image_size,
             render_quality=render_quality,
             observation=observation,
@@ -181,19 +158,14 @@ def load(
         )
     except ValueError as error:
         raise fault(path, f"cannot be shown ({error})") from error
-    used = stored.rewards[:, : num_steps * stride]
-    task_rewards = used.reshape(num_episodes, num_steps, stride).sum(2)
+    rewards = stored.rewards[:, :used].reshape(num_episodes, num_steps, stride).sum(2)
+    served = {"file": str(path), "action_repeat": action_repeat}
     return Demonstrations(
         frames,
         np.full(num_episodes, num_steps + 1),
-        stored.actions[:, : num_steps * stride : stride],
-        task_rewards,
-        {
-            **stored.metadata,
-            "file": str(path),
-            "action_repeat": action_repeat,
-            "returns": _returns(task_rewards),
-        },
+        stored.actions[:, :used:stride],
+        rewards,
+        {**metadata, **served, "returns": _returns(rewards)},
     )
 
 
@@ -282,7 +254,6 @@ def _returns(task_rewards: np.ndarray | None) -> list[float]:
 
 def _open_states(
     path: pathlib.Path,
-    *,
     task: str,
     num_episodes: int,
     action_repeat: int,
@@ -321,14 +292,14 @@ def _open_states(
     return stored, stride
 
 
-def _load_pixels(path: pathlib.Path, **settings: Any) -> Demonstrations:
-    """Reads a foreign file, or returns it again if it is the last one that was read."""
+def _load_pixels(path: pathlib.Path, *request: Any) -> Demonstrations:
+    """Reads a foreign file, or returns it again if it was the last one read."""
     try:
         parts = sorted(path.rglob("*")) if path.is_dir() else [path]
         stamps = tuple((str(part), part.stat().st_mtime_ns) for part in parts)
     except OSError as error:
         raise unreadable(path, error) from error
-    return _read_pixels(path, stamps, **settings)
+    return _read_pixels(path, stamps, *request)
 
 
 # Checked at the door and loaded afterwards: both are one reading. The pixels that this
@@ -337,7 +308,6 @@ def _load_pixels(path: pathlib.Path, **settings: Any) -> Demonstrations:
 def _read_pixels(
     path: pathlib.Path,
     stamps: tuple[tuple[str, int], ...],
-    *,
     task: str,
     num_episodes: int,
     image_size: int,
@@ -372,11 +342,7 @@ def _read_pixels(
         raise fault(path, str(error), _WAY_OUT) from error
     recording = read.recording
     if recording.task not in (None, task):
-        raise fault(
-            path,
-            f"shows {recording.task}, but the task is {task}",
-            "Set the one to the other's",
-        )
+        raise states.other_task(path, recording.task, task)
     metadata = {
         "task": recording.task,
         "file": str(path),

@@ -1,4 +1,4 @@
-"""Warnings: what of demonstrations can't match what the agent itself sees."""
+"""Warnings: how demonstrations differ from what the agent itself sees."""
 
 import logging
 import pathlib
@@ -20,70 +20,56 @@ def warn_of_pixels(
     task: str,
     action_repeat: int,
 ) -> None:
-    """Says what of a foreign file can't match the agent's own view.
+    """Warns where a foreign file cannot match the agent's view.
 
     Args:
       path: the file.
       metadata: of `Demonstrations` that were read from pixels.
-      image_size: the agent's, as are the next two.
+      image_size: the agent's, as are task and action repeat.
       task: `domain_task`.
-      action_repeat: environment frames per decision.
+      action_repeat: environment frames per agent step.
     """
-    size = image_size
-    height, width = metadata["stored_size"]
-    _logger.warning(
-        "%s (%s) holds pixels of a renderer that is not this one: what the agent sees "
-        "may differ in light, colour and camera.",
-        path,
-        metadata["kind"],
-    )
+    size, (height, width) = image_size, metadata["stored_size"]
+    messages = [
+        f"{path} ({metadata['kind']}) holds pixels of another renderer: light, colour "
+        "and camera may differ from what the agent sees."
+    ]
     if (height, width) != (size, size):
         squeezed = "" if height == width else ", squeezed into a square"
-        _logger.warning(
-            "%s: frames of %dx%d pixels are resized to %dx%d%s.",
-            path,
-            width,
-            height,
-            size,
-            size,
-            squeezed,
+        messages.append(
+            f"{path}: frames of {width}x{height} pixels are resized to {size}x{size}"
+            f"{squeezed}."
         )
     repeat = metadata["action_repeat"]
     if repeat is not None and repeat != action_repeat:
-        _logger.warning(
-            "%s was recorded with action_repeat=%d, and the run has %d: set "
-            "action_repeat or demonstrations.frame_skip so that they agree.",
-            path,
-            repeat,
-            action_repeat,
+        messages.append(
+            f"{path} was recorded with action_repeat={repeat}, and the run has "
+            f"{action_repeat}: set action_repeat or demonstrations.frame_skip so that "
+            "they agree."
         )
     speed = metadata["frames_per_second"]
     wanted = 1.0 / suite.decision_seconds(task, action_repeat)
     if speed is not None and abs(speed / wanted - 1.0) > _RATE_TOLERANCE:
-        _logger.warning(
-            "%s has %.3g frames per second, and the agent decides %.3g times: set "
-            "demonstrations.frame_skip, now such that about %.3g frames make one.",
-            path,
-            speed,
-            wanted,
-            speed / wanted,
+        messages.append(
+            f"{path} has {speed:.3g} frames per second, and the agent makes "
+            f"{wanted:.3g} steps: about {speed / wanted:.3g} frames make one step. "
+            "Adjust demonstrations.frame_skip or action_repeat."
         )
-    for note in metadata["notes"]:
-        _logger.warning("%s: %s", path, note)
+    messages += [f"{path}: {note}" for note in metadata["notes"]]
+    for message in messages:
+        _logger.warning("%s", message)
 
 
 def warn_of_versions(path: pathlib.Path, recorded: dict[str, str]) -> None:
-    """Says which simulator versions differ from those that recorded a state file."""
-    installed = suite.simulator_versions()
+    """Warns where simulator versions differ from those that recorded a state file."""
     differing = [
         f"{name} {recorded.get(name)} (here {version})"
-        for name, version in installed.items()
+        for name, version in suite.simulator_versions().items()
         if recorded.get(name) != version
     ]
     if differing:
         _logger.warning(
-            "%s was recorded with %s: its images are drawn here, but the task may move "
-            "or look slightly different now.",
+            "%s was recorded with %s: the task may move or look slightly different.",
             path,
             ", ".join(differing),
         )

@@ -1,23 +1,37 @@
-"""Images of stored simulator states, drawn once per machine and then cached."""
+"""Images of stored simulator states, rendered once per machine and then cached."""
 
+import concurrent.futures
+import contextlib
+import functools
 import hashlib
 import json
 import logging
+import multiprocessing
 import os
 import pathlib
-import tempfile
-from collections.abc import Callable, Mapping
+import sys
+import threading
+import types
+from collections.abc import Callable, Generator, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
-from jaxil.demonstrations import drawing
-from jaxil.demonstrations.drawer import Episode
 from jaxil.environments import suite
+from jaxil.environments.pixel_environment import PixelEnvironment
+from jaxil.environments.pool import interrupts_blocked
+from jaxil.files import archive
 from jaxil.machine.cache import cache_folder
 
-# Part of each key: raise it when drawing changes in a way that the key can't see.
+# Part of each key: raise it when rendering changes in a way that the key cannot see.
 _CACHE_VERSION = 2
+_MAX_PROCESSES = 8  # some 250 MB each
+# Some seconds of software rendering: less is done before another process has started.
+_WORTH_PIXELS = 2_000_000
+_SILENCE_SECONDS = 1800.0  # without a finished episode, until they are given up
+_SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer")
+
+States = dict[str, np.ndarray]  # `qpos`, `qvel` and `act` of one episode, [N + 1, n]
 
 _logger = logging.getLogger(__name__)
 
@@ -42,13 +56,13 @@ def observe_episodes(
       task: `domain_task`.
       seed: of the environment that recorded them.
       first_episode: number of episode 0 there. With the seed it restores what the
-        states don't hold: targets, terrain.
+        states lack: targets, terrain.
       image_size: height and width in pixels.
       render_quality: "paper", "fast" or "smooth".
       observation: "pixels" or "state".
       cache: whether images are looked up in, and added to, `cache_folder()`.
-      progress: called with (images drawn, images in all), if any have to be.
-      processes: how many draw, see `drawing.draw`; the images are the same.
+      progress: called with (images rendered, images in all), if any have to be.
+      processes: how many render; None for as many as pay. The images are the same.
 
     Returns:
       Images, uint8 [K, N + 1, H, W, 3], or states, float32 [K, N + 1, S].
@@ -65,107 +79,214 @@ def observe_episodes(
         "render_quality": render_quality,
         "observation": observation,
     }
-    environment = suite.make_environment(**settings)
-    try:
+    with suite.make_environment(**settings) as environment:
         spec = environment.observation_spec()
         num_episodes, length = states["qpos"].shape[:2]
         observed = np.empty((num_episodes, length, *spec.shape), spec.dtype)
-        caches = cache and observation == "pixels"
-        about = {
-            "task": task,
-            "seed": seed,
-            "image_size": image_size,
-            "render_quality": render_quality,
-            "camera": suite.camera_of(task),
-            "versions": suite.simulator_versions(),
-            "gl": environment.renderer.gl_name() if caches else "",
+        of_episode = [
+            {name: array[index] for name, array in states.items()}
+            for index in range(num_episodes)
+        ]
+        paths: list[pathlib.Path] = []
+        if cache and observation == "pixels":
+            about = {
+                "task": task,
+                "seed": seed,
+                "image_size": image_size,
+                "render_quality": render_quality,
+                "camera": suite.camera_of(task),
+                "versions": suite.simulator_versions(),
+                "gl": environment.renderer.gl_name(),
+                "cache_version": _CACHE_VERSION,
+            }
+            paths = [
+                _cache_path({**about, "episode": first_episode + index}, each)
+                for index, each in enumerate(of_episode)
+            ]
+        missing = {
+            index: each
+            for index, each in enumerate(of_episode)
+            if not paths or not _read_cached(paths[index], observed[index])
         }
-        episodes = [
-            Episode(
-                place,
-                first_episode + place,
-                {name: array[place] for name, array in states.items()},
+        num_rendered = (num_episodes - len(missing)) * length
+
+        def show(num_images: int) -> None:
+            nonlocal num_rendered
+            num_rendered += num_images
+            if progress is not None:
+                progress(num_rendered, num_episodes * length)
+
+        def finish(index: int) -> None:
+            del missing[index]
+            if paths:
+                _write_cached(paths[index], observed[index])
+
+        if observation != "pixels":
+            processes = 1
+        elif processes is None:
+            num_pixels = len(missing) * length * image_size**2
+            processes = how_many(num_pixels, environment.renderer.gl_name())
+        if processes > 1 and len(missing) > 1:
+            rendered = _render_together(
+                min(processes, len(missing)),
+                {first_episode + index: each for index, each in missing.items()},
+                settings,
+                environment.renderer.gl_name(),
             )
-            for place in range(num_episodes)
-        ]
-        paths = [
-            _cache_path({**about, "episode": episode.number}, episode.states)
-            for episode in episodes
-        ]
-        missing = []
-        for episode, path in zip(episodes, paths):
-            found = _read_cached(path, observed[episode.place]) if caches else None
-            if found is None:
-                missing.append(episode)
-            else:
-                observed[episode.place] = found
-        num_drawn = (num_episodes - len(missing)) * length
-
-        def take(place: int, start: int, images: np.ndarray) -> None:
-            nonlocal num_drawn
-            end = start + len(images)
-            observed[place, start:end] = images
-            for _ in images:
-                num_drawn += 1
-                if progress is not None:
-                    progress(num_drawn, num_episodes * length)
-            if caches and end == length:
-                _write_cached(paths[place], observed[place])
-
-        drawing.draw(
-            environment,
-            missing,
-            settings=settings,
-            take=take,
-            processes=processes if observation == "pixels" else 1,
-        )
-    finally:
-        environment.close()
+            with contextlib.closing(rendered):
+                for number, images in rendered:
+                    observed[number - first_episode] = images
+                    finish(number - first_episode)
+                    show(length)
+        for index, each in list(missing.items()):
+            images = _images(environment, first_episode + index, each)
+            for time_index, image in enumerate(images):
+                observed[index, time_index] = image
+                show(1)
+            finish(index)
     return observed
 
 
-def _cache_path(
-    about: dict[str, Any], states: Mapping[str, np.ndarray]
-) -> pathlib.Path:
+def how_many(num_pixels: int, gl_name: str) -> int:
+    """Returns how many processes should render; 1 where more don't pay.
+
+    Args:
+      num_pixels: of all images.
+      gl_name: what renders, see `Renderer.gl_name`.
+    """
+    # GPUs are fast enough alone, and EGL contexts of several processes at once have
+    # been seen to hang there.
+    is_software = any(name in gl_name.lower() for name in _SOFTWARE)
+    if not is_software or num_pixels < _WORTH_PIXELS:
+        return 1
+    return min(len(os.sched_getaffinity(0)), _MAX_PROCESSES)
+
+
+def _images(
+    environment: PixelEnvironment, number: int, states: States
+) -> Iterator[np.ndarray]:
+    """Renders the moments of an episode one by one, uint8 [H, W, 3].
+
+    The environment is reset to the episode: that alone tells what the states lack.
+    """
+    environment.reset(episode=number)
+    for values in zip(*states.values(), strict=True):
+        environment.set_simulator_state(**dict(zip(states, values, strict=True)))
+        yield environment.single_observation()
+
+
+def _render_together(
+    processes: int, episodes: dict[int, States], settings: dict[str, Any], gl_name: str
+) -> Generator[tuple[int, np.ndarray], None, None]:
+    """Yields episodes' numbers and images in any order, until one fails.
+
+    A software renderer hardly uses more than one core for a small image, so processes
+    divide the time by their number. None of them is left when the generator is closed.
+    """
+    executor = concurrent.futures.ProcessPoolExecutor(
+        processes,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_end_with_parent,
+    )
+    others = set(multiprocessing.active_children())
+    try:
+        with interrupts_blocked(), _main_hidden():
+            numbers = {
+                executor.submit(_render_episode, settings, gl_name, *item): item[0]
+                for item in episodes.items()
+            }
+        pending = set(numbers)
+        while pending:
+            done, pending = concurrent.futures.wait(
+                pending, _SILENCE_SECONDS, concurrent.futures.FIRST_COMPLETED
+            )
+            if not done:
+                raise TimeoutError(f"no episode in {_SILENCE_SECONDS:g} s")
+            for future in done:
+                yield numbers[future], future.result()
+    except Exception as error:
+        _logger.warning(
+            "processes that render failed (%s); the rest is rendered without them",
+            str(error) or type(error).__name__,
+        )
+    finally:
+        # Killed, because GL drivers have been seen to hang while they clean up.
+        for process in set(multiprocessing.active_children()) - others:
+            process.kill()
+        executor.shutdown()
+
+
+@contextlib.contextmanager
+def _main_hidden() -> Iterator[None]:
+    """Keeps spawned processes from importing, that is running, the caller's script."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+
+
+def _end_with_parent() -> None:
+    """Lets a process of the executor end when its parent is killed."""
+    os.environ.setdefault("LP_NUM_THREADS", "0")  # of llvmpipe: we use the cores
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _render_episode(
+    settings: dict[str, Any], gl_name: str, number: int, states: States
+) -> np.ndarray:
+    """Runs in another process; returns an episode's images [N + 1, H, W, 3]."""
+    environment = _own_environment(**settings)
+    found = environment.renderer.gl_name()
+    if found != gl_name:
+        raise RuntimeError(f"they render with {found}, not with {gl_name}")
+    return np.stack(list(_images(environment, number, states)))
+
+
+_own_environment = functools.cache(suite.make_environment)
+
+
+def _cache_path(about: dict[str, Any], states: States) -> pathlib.Path:
     """Returns a file whose name changes with all that changes an episode's pixels."""
-    about = {**about, "cache_version": _CACHE_VERSION}
     digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
     for name, array in sorted(states.items()):
         digest.update(f"{name}{array.dtype.str}{array.shape}".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
-    name = f"{about['task']}-{digest.hexdigest()[:24]}.npy"
+    name = f"{about['task']}-{digest.hexdigest()[:24]}.npz"
     return cache_folder() / "frames" / name
 
 
-def _read_cached(path: pathlib.Path, like: np.ndarray) -> np.ndarray | None:
-    """Returns the array at `path`; None unless it is whole and shaped `like`."""
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError):
-        return None
-    if getattr(array, "shape", None) != like.shape or array.dtype != like.dtype:
-        return None
-    return array
+def _read_cached(path: pathlib.Path, images: np.ndarray) -> bool:
+    """Fills `images` from a cached file, if that is undamaged and of its shape.
 
-
-def _write_cached(path: pathlib.Path, array: np.ndarray) -> None:
-    """Stores `array` whole or not at all; where that fails, says so and goes on.
-
-    Several processes may store the same: each renames a file of its own over it.
+    The archive holds a checksum of the pixels, which is verified.
     """
-    temporary = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, suffix=".part")
-        temporary = pathlib.Path(name)
-        with os.fdopen(handle, "wb") as file:
-            np.save(file, array, allow_pickle=False)
-        temporary.replace(path)
+        limits = {"images": images.nbytes + 1000}
+        found = archive.read_archive(path, max_bytes=limits)["images"]
+    except (OSError, ValueError):
+        return False
+    if found.shape != images.shape or found.dtype != images.dtype:
+        return False
+    images[:] = found
+    return True
+
+
+def _write_cached(path: pathlib.Path, images: np.ndarray) -> None:
+    """Stores images, or warns. Several processes may store the same."""
+    try:
+        archive.write_archive(path, [("images", images)], compressed=False)
     except OSError as error:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
         _logger.warning(
-            "images are not cached, so the next run draws them again: %s. "
+            "images are not cached, so the next run renders them again: %s. "
             "JAXIL_CACHE=DIR names another folder.",
             error,
         )

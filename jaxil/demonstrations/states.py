@@ -12,7 +12,6 @@ renderer of another machine. Baselines alone may look at actions and rewards.
 
 import importlib.metadata
 import json
-import math
 import os
 import pathlib
 from typing import Any, NamedTuple
@@ -24,7 +23,7 @@ from jaxil.files import archive
 
 FORMAT = "jaxil-demonstrations"
 VERSION = 1
-MAX_ARRAY_BYTES = archive.MAX_MEMBER_BYTES
+MAX_ARRAY_BYTES = archive.MAX_BYTES
 _MAX_METADATA_BYTES = 1024**2
 _ARRAYS = {  # name: dtype, number of axes, states per episode beyond its steps
     "qpos": (np.dtype(np.float64), 3, 1),
@@ -43,6 +42,7 @@ _METADATA = {
     "expert": str,
     "returns": list,
 }
+_CHECK_PATH = "Check the path in demonstrations.source"
 _REMAKE = "Record it again with `python -m jaxil.collect`, or name another file"
 
 
@@ -69,6 +69,13 @@ class StateDemonstrations(NamedTuple):
     rewards: np.ndarray
     metadata: dict[str, Any]
 
+    def simulator_states(
+        self, times: np.ndarray | slice, episodes: slice = slice(None)
+    ) -> dict[str, np.ndarray]:
+        """Returns `qpos`, `qvel` and `act` of some episodes at some times."""
+        named = {name: getattr(self, name) for name in ("qpos", "qvel", "act")}
+        return {name: array[episodes, times] for name, array in named.items()}
+
 
 def new_metadata(
     *,
@@ -78,7 +85,6 @@ def new_metadata(
     first_episode: int,
     expert: str,
     rewards: np.ndarray,
-    camera: int | None = None,
 ) -> dict[str, Any]:
     """Returns the metadata of freshly recorded demonstrations.
 
@@ -86,18 +92,17 @@ def new_metadata(
       task: `domain_task`.
       action_repeat: environment frames per stored step.
       seed: the recording environment's; with the episode's number it restores what
-        a task draws at random beyond the state.
+        a task samples at random beyond the state.
       first_episode: number of episode 0; the others follow it without a gap.
       expert: how the expert was made, for people.
       rewards: task rewards. Shape [K, T].
-      camera: what the expert was looked at through; None for `camera_of(task)`.
     """
     return {
         "format": FORMAT,
         "version": VERSION,
         "task": task,
         "action_repeat": action_repeat,
-        "camera": suite.camera_of(task) if camera is None else camera,
+        "camera": suite.camera_of(task),
         "versions": {
             **suite.simulator_versions(),
             "jaxil": importlib.metadata.version("jaxil"),
@@ -147,14 +152,20 @@ def write_states(path: str | os.PathLike, demonstrations: StateDemonstrations) -
 
 
 def recognises(path: pathlib.Path) -> bool:
-    """Says whether `path` is a file of this format, as far as its names tell."""
+    """Returns whether `path` is a file of this format, judged by its arrays' names.
+
+    Raises:
+      DemonstrationError: it is neither a file nor a folder, but a device or a pipe.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise fault(path, "is neither a file nor a folder", _CHECK_PATH)
     return "qpos" in archive.member_names(path)
 
 
 def read_states(
     path: str | os.PathLike, *, task: str | None = None, num_episodes: int | None = None
 ) -> StateDemonstrations:
-    """Reads a demonstration file and checks all of it; nothing is drawn.
+    """Reads a demonstration file and checks all of it; nothing is rendered.
 
     Args:
       path: the file.
@@ -166,7 +177,7 @@ def read_states(
         is damaged, or is not what was asked for.
     """
     path = pathlib.Path(path)
-    limits = dict.fromkeys(_ARRAYS, archive.MAX_MEMBER_BYTES)
+    limits = dict.fromkeys(_ARRAYS, archive.MAX_BYTES)
     limits["metadata"] = _MAX_METADATA_BYTES
     try:
         arrays = archive.read_archive(path, max_bytes=limits)
@@ -180,11 +191,7 @@ def read_states(
     demonstrations = StateDemonstrations(**arrays, metadata=metadata)
     _check(path, demonstrations)
     if task is not None and metadata["task"] != task:
-        raise fault(
-            path,
-            f"shows {metadata['task']}, but the task is {task}",
-            "Set the one to the other's",
-        )
+        raise other_task(path, metadata["task"], task)
     stored = len(demonstrations.rewards)
     if num_episodes is None:
         return demonstrations
@@ -208,17 +215,19 @@ def fault(path: pathlib.Path, what: str, way_out: str = _REMAKE) -> Demonstratio
     return DemonstrationError(f"{path} {what}. {way_out}.")
 
 
-def unreadable(path: pathlib.Path, error: OSError) -> DemonstrationError:
-    """Returns what to raise where the system refuses a file."""
+def other_task(path: pathlib.Path, shown: str, task: str) -> DemonstrationError:
+    """Returns what to raise where a file shows another task than the run's."""
     return fault(
-        path,
-        f"cannot be read ({error.strerror or error})",
-        "Check the path in demonstrations.source",
+        path, f"shows {shown}, but the task is {task}", "Set the one to the other's"
     )
 
 
+def unreadable(path: pathlib.Path, error: OSError) -> DemonstrationError:
+    """Returns what to raise where the system refuses a file."""
+    return fault(path, f"cannot be read ({error.strerror or error})", _CHECK_PATH)
+
+
 def _check(path: pathlib.Path, demonstrations: StateDemonstrations) -> None:
-    """Raises DemonstrationError where arrays or metadata break the format's rules."""
     what = _metadata_fault(demonstrations.metadata) or _array_fault(demonstrations)
     if what is not None:
         raise fault(path, what)
@@ -251,10 +260,8 @@ def _array_fault(demonstrations: StateDemonstrations) -> str | None:
         array = getattr(demonstrations, name)
         if array.dtype != dtype:
             return f"has {name} of type {array.dtype}, where {dtype} is expected"
-        if array.ndim != num_axes or array.shape[:2] != (
-            num_episodes,
-            num_steps + extra,
-        ):
+        shape = (num_episodes, num_steps + extra)
+        if array.ndim != num_axes or array.shape[:2] != shape:
             return (
                 f"has {name} of shape {array.shape}, which does not fit rewards of "
                 f"shape {rewards.shape}"
@@ -263,11 +270,7 @@ def _array_fault(demonstrations: StateDemonstrations) -> str | None:
             episode = int(np.argwhere(~np.isfinite(array))[0, 0])
             return f"has a NaN or infinity in {name}, episode {episode}"
     returns = demonstrations.metadata["returns"]
-    numbers = all(isinstance(value, int | float) for value in returns)
-    if (
-        len(returns) != num_episodes
-        or not numbers
-        or not all(map(math.isfinite, returns))
-    ):
+    are_numbers = all(isinstance(x, int | float) and abs(x) < 1e300 for x in returns)
+    if len(returns) != num_episodes or not are_numbers:
         return f"has metadata returns={returns!r}, where {num_episodes} numbers belong"
     return None

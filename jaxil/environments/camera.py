@@ -1,4 +1,4 @@
-"""The renderer: what draws a simulation, at one of three qualities."""
+"""Renders a simulation at one of three qualities."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,7 +8,7 @@ import numpy as np
 RENDER_QUALITIES = ("paper", "fast", "smooth")
 # Shadow maps and four-fold supersampling are most of a software renderer's work.
 _FAST_FLAGS = {"shadow": False, "reflection": False}
-# "smooth" draws this many times larger and averages: without it, a thin pole jumps
+# "smooth" renders this many times larger and averages: without it, a thin pole jumps
 # from pixel to pixel, and nothing in a small image shows how fast it turns.
 _SMOOTH_FACTOR = 2
 
@@ -20,8 +20,8 @@ OpenCamera = Callable[[Any, int, int], Any]
 class Renderer:
     """One camera on one simulation, kept for as long as the simulation lives.
 
-    dm_control's own `physics.render` builds camera and scene anew for each image,
-    which in software takes longer than drawing.
+    dm_control's own `physics.render` builds camera and scene for each image, which in
+    software takes longer than rendering.
     """
 
     def __init__(
@@ -33,19 +33,19 @@ class Renderer:
         camera: int,
         render_quality: str,
     ):
-        """Prepares to draw; the GL context is made at the first image.
+        """Prepares to render; the GL context is made at the first image.
 
         Args:
           physics: a dm_control `Physics` that has not been rendered yet.
-          open_camera: dm_control's way to a camera, asked at the first image.
+          open_camera: called at the first image.
           image_size: height and width in pixels.
           camera: index of a camera of the model.
-          render_quality: "paper" for dm_control's defaults, "fast" for neither
-            supersampling nor shadows nor reflections, "smooth" for "fast" at twice
-            the size, averaged over 2x2 pixels.
+          render_quality: "paper" for dm_control's defaults; "fast" without
+            supersampling, shadows and reflections; "smooth" for "fast" at twice the
+            size, averaged over 2x2 pixels.
 
         Raises:
-          ValueError: unknown quality, no such camera, or a size below one.
+          ValueError: unknown quality, or a size below one.
         """
         if render_quality not in RENDER_QUALITIES:
             raise ValueError(
@@ -54,64 +54,51 @@ class Renderer:
             )
         if image_size < 1:
             raise ValueError(f"image_size={image_size} must be at least 1 pixel.")
-        num_cameras = int(physics.model.ncam)
-        if not 0 <= camera < num_cameras:
-            raise ValueError(
-                f"camera={camera} does not exist: the model has {num_cameras}, "
-                f"numbered from 0."
-            )
-        self._physics = physics
-        self._open_camera = open_camera
-        self.image_size = image_size
-        self._camera_index = camera
+        self._physics, self._open_camera = physics, open_camera
+        self.image_size, self._camera_index = image_size, camera
         self._flags = None if render_quality == "paper" else _FAST_FLAGS
         self._factor = _SMOOTH_FACTOR if render_quality == "smooth" else 1
         self._camera = None
         vis = physics.model.vis
-        # Both are read when the GL context is made, so they must be set before.
+        # All are read when the GL context is made, so they must be set before.
         if render_quality != "paper":
             vis.quality.offsamples = 0
             # Spheres of fewer triangles: half or less of the time, 0.1 to 0.2 grey
             # levels of mean difference at 48x48.
             vis.quality.numslices, vis.quality.numstacks = 12, 8
-        drawn_size = self._factor * image_size
-        vis.global_.offwidth = max(int(vis.global_.offwidth), drawn_size)
-        vis.global_.offheight = max(int(vis.global_.offheight), drawn_size)
+        self._size = self._factor * image_size
+        vis.global_.offwidth = max(int(vis.global_.offwidth), self._size)
+        vis.global_.offheight = max(int(vis.global_.offheight), self._size)
 
     def render(self) -> np.ndarray:
-        """Draws the simulation as it stands. uint8 [H, W, 3], the caller's to keep.
+        """Returns a new image of the simulation as it is now, uint8 [H, W, 3].
 
         Raises:
           RuntimeError: this machine has no usable GL.
         """
         image = self._opened().render(render_flag_overrides=self._flags)
-        if self._factor == 1:
-            # The camera hands out its one buffer, overwritten by the next image.
-            return image.copy()
-        n = self._factor
-        total = np.full((self.image_size, self.image_size, 3), n * n // 2, np.uint16)
+        n, size = self._factor, self.image_size
+        if n == 1:
+            return image.copy()  # the camera overwrites its one buffer
+        total = np.full((size, size, 3), n * n // 2, np.uint16)
         for i, j in np.ndindex(n, n):
             total += image[i::n, j::n]
         return (total // (n * n)).astype(np.uint8)
 
     def gl_name(self) -> str:
-        """Returns what GL calls the device that draws, such as "llvmpipe (...)"."""
+        """Returns GL's name of the device that renders, such as "llvmpipe (...)"."""
         self._opened()
         from OpenGL import GL
 
-        def name() -> str:
-            raw = GL.glGetString(GL.GL_RENDERER)
-            return raw.decode() if isinstance(raw, bytes) else str(raw)
-
         with self._physics.contexts.gl.make_current() as context:
-            return str(context.call(name))
+            raw = context.call(GL.glGetString, GL.GL_RENDERER)
+        return raw.decode() if isinstance(raw, bytes) else str(raw)
 
     def _opened(self) -> Any:
         if self._camera is None:
-            drawn_size = self._factor * self.image_size
             try:
                 self._camera = self._open_camera(
-                    self._physics, drawn_size, self._camera_index
+                    self._physics, self._size, self._camera_index
                 )
             except (RuntimeError, ImportError) as error:
                 raise RuntimeError(

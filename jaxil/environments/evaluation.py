@@ -1,25 +1,23 @@
 """How good a policy is by the task's own reward."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxil.environments.interaction import (
-    Act,
-    Decision,
-    interact,
-    join,
-)
+from jaxil.environments.player import InProcess, Player
 from jaxil.maths.types import Episode
+
+Act = Callable[[np.ndarray], np.ndarray]  # observation -> action [A]
 
 
 class Evaluation(NamedTuple):
     """Episodes of one policy.
 
     Attributes:
-      episodes: what was seen and done in each.
+      episodes: E of them.
       task_returns: undiscounted sums of the task's reward. Shape [E].
-      video: images of the first episode, uint8 [T + 1, H, W, 3]; None if not asked.
+      video: images of the first episode, uint8 [T + 1, H, W, 3]; None if not asked for.
     """
 
     episodes: list[Episode]
@@ -37,6 +35,10 @@ class Evaluation(NamedTuple):
         return float(np.std(self.task_returns))
 
 
+class Stopped(Exception):
+    """Someone asked to stop in the middle of an evaluation."""
+
+
 def evaluate(
     environment: Any,
     act: Act,
@@ -44,34 +46,35 @@ def evaluate(
     num_episodes: int,
     first_episode: int,
     record_video: bool = False,
+    stop_asked: Callable[[], bool] = lambda: False,
 ) -> Evaluation:
     """Plays whole episodes without learning.
 
     Args:
-      environment: one that nothing else uses, with `frame()` for videos.
+      environment: an `Environment` that nothing else uses, with `frame()` for videos.
       act: the policy; deterministic for the numbers that are reported.
-      num_episodes: how many, at least 1.
+      num_episodes: at least 1.
       first_episode: number of the first, which fixes how each one starts.
       record_video: whether to keep the first episode's images.
+      stop_asked: asked before each agent step.
+
+    Raises:
+      Stopped: `stop_asked` returned True.
     """
+    player = Player(InProcess(environment), first_episode=first_episode)
     episodes: list[Episode] = []
-    returns: list[float] = []
-    played: list[Decision] = []
     images: list[np.ndarray] = []
-    if record_video:
-        # The reset's own image, before the first decision replaces it.
-        environment.reset(episode=first_episode)
-        images.append(environment.frame())
-    for decision in interact(environment, act, first_episode=first_episode):
-        played.append(decision)
-        if record_video and not episodes:
+    while len(episodes) < num_episodes:
+        if stop_asked():
+            raise Stopped
+        began = player.begin(lambda _: True)
+        films = record_video and not episodes
+        if films and began:
             images.append(environment.frame())
-        if decision.is_last:
-            episodes.append(join(played))
-            # In double precision, as rewards come, whatever an episode stores.
-            returns.append(sum(each.task_reward for each in played))
-            played = []
-            if len(episodes) == num_episodes:
-                break
+        player.step(np.asarray(act(player.observations[0]))[None])
+        episodes += player.observe()
+        if films:
+            images.append(environment.frame())
+    returns = [episode.rewards.sum(dtype=np.float64) for episode in episodes]
     video = np.stack(images) if record_video else None
     return Evaluation(episodes, np.asarray(returns), video)

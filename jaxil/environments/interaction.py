@@ -1,86 +1,53 @@
-"""The agent and its environment, one decision at a time, or one of each of several."""
+"""What the training loop needs of a simulator, and of several of them."""
 
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
+import dm_env
 import numpy as np
-
-from jaxil.maths.types import Episode
-
-Act = Callable[[np.ndarray], np.ndarray]  # observation -> action [A]
+from dm_env import specs
 
 
-class Decision(NamedTuple):
-    """One agent step.
+@runtime_checkable
+class Environment(Protocol):
+    """One simulator; time runs in agent steps.
 
-    Attributes:
-      frame: what came of it, not stacked. uint8 [H, W, 3] or float32 [S].
-      first_frame: on an episode's first decision, the frame at its reset; else None.
-      action: shape [A].
-      task_reward: summed over the action repeat.
-      discount: product over the action repeat; 1 at a time limit.
-      is_last: whether the episode ended with it.
-      episode: number of the episode, from 0.
+    A `PixelEnvironment` is one; implement these methods to train in another simulator.
     """
 
-    frame: np.ndarray
-    first_frame: np.ndarray | None
-    action: np.ndarray
-    task_reward: float
-    discount: float
-    is_last: bool
-    episode: int
+    @property
+    def episode_steps(self) -> int | None:
+        """Agent steps of a whole episode; None where only the task ends it."""
+        ...
 
+    def observation_spec(self) -> specs.Array:
+        """Returns the spec of observations: uint8 [H, W, C] or float32 [S]."""
+        ...
 
-def interact(
-    environment: Any,
-    act: Act,
-    *,
-    first_episode: int,
-    meanwhile: Callable[[], None] = lambda: None,
-) -> Iterator[Decision]:
-    """Yields decisions without end, episode after episode.
+    def action_spec(self) -> specs.BoundedArray:
+        """Returns the spec of actions: float32 [A] in [-1, 1]."""
+        ...
 
-    Episode i starts from the state that `environment.reset(episode=i)` gives, so a
-    resumed run meets the same starts as an unbroken one.
+    def reset(self, episode: int) -> dm_env.TimeStep:
+        """Starts an episode, whose number alone fixes its start."""
+        ...
 
-    Args:
-      environment: a `PixelEnvironment`, or anything with its `reset(episode)`,
-        `step(action)` and `single_observation()`.
-      act: the policy.
-      first_episode: number of the first episode.
-      meanwhile: called between a decision's action and its step: what it starts on a
-        device goes on while the simulator steps and draws.
-    """
-    episode = first_episode
-    while True:
-        timestep = environment.reset(episode=episode)
-        first_frame = environment.single_observation()
-        while not timestep.last():
-            action = np.asarray(act(timestep.observation), np.float32)
-            meanwhile()
-            timestep = environment.step(action)
-            yield Decision(
-                frame=environment.single_observation(),
-                first_frame=first_frame,
-                action=action,
-                task_reward=float(timestep.reward),
-                discount=float(timestep.discount),
-                is_last=timestep.last(),
-                episode=episode,
-            )
-            first_frame = None
-        episode += 1
+    def step(self, action: np.ndarray) -> dm_env.TimeStep:
+        """Applies an action; a time limit ends an episode with a discount of 1."""
+        ...
+
+    def single_observation(self) -> np.ndarray:
+        """Returns the present frame, not stacked: uint8 [H, W, 3] or float32 [S]."""
+        ...
 
 
 class Moment(NamedTuple):
-    """What an environment shows after a reset or a step; arrays are the reader's.
+    """What an environment shows after a reset or a step.
 
     Attributes:
       observation: what the policy sees. uint8 [H, W, C] or float32 [S].
       frame: the present alone, as a replay stores it. uint8 [H, W, 3] or float32 [S].
       task_reward: summed over the action repeat; 0 at a reset.
-      discount: product over the action repeat; 1 at a reset.
+      discount: product over the action repeat; 1 at a reset, and at a time limit.
       is_last: whether the episode is over.
     """
 
@@ -92,45 +59,22 @@ class Moment(NamedTuple):
 
 
 class Environments(Protocol):
-    """Several environments that work while one waits; see `pool.Pool`."""
+    """Several simulators that work while their user does something else."""
 
     size: int
 
-    def reset(self, place: int, episode: int) -> None:
-        """Sends an environment to the start of an episode."""
+    def reset(self, index: int, episode: int) -> None:
+        """Sends one to the start of an episode."""
         ...
 
-    def step(self, place: int, action: np.ndarray) -> None:
-        """Sends it an action."""
+    def step(self, index: int, action: np.ndarray) -> None:
+        """Sends it an action, shape [A]."""
         ...
 
-    def receive(self, place: int) -> Moment | None:
+    def receive(self, index: int) -> Moment | None:
         """Waits for the outcome; None if it was lost, and the episode with it."""
         ...
 
     def close(self) -> None:
         """Ends their processes."""
         ...
-
-
-def join(decisions: list[Decision]) -> Episode:
-    """Returns the episode that `decisions` make up.
-
-    Args:
-      decisions: all of one episode, in order.
-
-    Raises:
-      ValueError: they do not start at a reset, or do not reach the end.
-    """
-    first, last = decisions[0], decisions[-1]
-    if first.first_frame is None or not last.is_last:
-        raise ValueError(
-            f"episode {first.episode} is not whole: an episode runs from its reset to "
-            "its last decision"
-        )
-    return Episode(
-        frames=np.stack([first.first_frame, *(d.frame for d in decisions)]),
-        actions=np.stack([d.action for d in decisions]),
-        rewards=np.asarray([d.task_reward for d in decisions], np.float32),
-        discounts=np.asarray([d.discount for d in decisions], np.float32),
-    )

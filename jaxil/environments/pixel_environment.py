@@ -1,6 +1,5 @@
-"""An agent's view of a suite task: in agent steps, as stacked images or as states."""
+"""A suite task as the agent sees it: agent steps, stacked images or states."""
 
-import collections
 import math
 from typing import Any
 
@@ -9,6 +8,7 @@ import numpy as np
 from dm_env import specs
 
 from jaxil.environments.camera import Renderer
+from jaxil.replay.stacking import gather_stacks
 
 _SEED_WORDS = 8
 # MuJoCo's stand-in for "no bound" on an actuator; no sensible range to rescale to.
@@ -16,13 +16,13 @@ _UNBOUNDED = 1e9
 
 
 class PixelEnvironment(dm_env.Environment):
-    """A suite task seen through its camera.
+    """A suite task seen through its camera; an `interaction.Environment`.
 
     Time runs in agent steps, each of `action_repeat` environment frames. The last
     `frame_stack` images form one observation, uint8 [H, W, 3 * frame_stack], oldest
     first; at a reset the first image stands for the missing ones. With
-    `observation="state"` it is the suite's own observation instead, flattened, of
-    one time only, float32 [S], and nothing is rendered unless asked for.
+    `observation="state"` it is the suite's own observation of the present, flattened,
+    float32 [S], and nothing is rendered unless asked for.
     """
 
     def __init__(
@@ -38,17 +38,15 @@ class PixelEnvironment(dm_env.Environment):
     ):
         """Wraps `suite_environment`; see `make_environment` for the arguments."""
         self._suite_environment = suite_environment
-        self._name = task
-        self._seed = seed
+        self._name, self._seed = task, seed
         self._action_repeat = action_repeat
         self._renders = observation == "pixels"
-        self._renderer = renderer
-        self._num_episodes_started = 0
+        self.renderer = renderer
+        self.num_episodes_started = 0  # the number of the next `reset()`
         self._reset_next_step = True
-        self._current: np.ndarray | None = None  # drawn or read at the present time
-        self._frames: collections.deque[np.ndarray] = collections.deque(
-            maxlen=frame_stack
-        )
+        self._current: np.ndarray | None = None  # frame of the present, once known
+        self._frames: list[np.ndarray] = []  # of the observation
+        self._frame_stack = frame_stack
         bounds = suite_environment.action_spec()
         bounded = np.abs(bounds.maximum) < _UNBOUNDED
         self._action_low = np.where(bounded, bounds.minimum, -1.0)
@@ -82,12 +80,11 @@ class PixelEnvironment(dm_env.Environment):
         """Starts an episode.
 
         Args:
-          episode: number of the episode, from 0: together with the seed it fixes
-            the start, whatever was played before. None takes the number after the
-            last one played.
+          episode: number of the episode, from 0: with the seed it fixes the start,
+            whatever was played before. None takes the number after the last one.
         """
         if episode is None:
-            episode = self._num_episodes_started
+            episode = self.num_episodes_started
         if episode < 0:
             raise ValueError(f"episode={episode} must not be negative.")
         words = np.random.SeedSequence([self._seed, episode]).generate_state(
@@ -95,21 +92,17 @@ class PixelEnvironment(dm_env.Environment):
         )
         self._suite_environment.task.random.seed(words)
         self._suite_environment.reset()
-        self._num_episodes_started = episode + 1
+        self.num_episodes_started = episode + 1
         self._reset_next_step = False
-        self._current = None
-        self._frames.clear()
+        self._current, self._frames = None, []
         return dm_env.restart(self._observe())
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
-        """Applies `action` for one agent step, or resets after an episode's end.
-
-        Args:
-          action: Shape [A], in [-1, 1].
+        """Applies an action [A] in [-1, 1], or resets after an episode's end.
 
         Returns:
-          The time step: rewards of the repeats summed, discounts multiplied. The
-          discount stays 1 where a time limit ends the episode.
+          Rewards of the repeats summed, discounts multiplied. The discount stays 1
+          where a time limit ends the episode.
 
         Raises:
           ValueError: `action` has another shape.
@@ -148,18 +141,17 @@ class PixelEnvironment(dm_env.Environment):
         return self._observation_spec
 
     def single_observation(self) -> np.ndarray:
-        """Returns the present alone: uint8 [H, W, 3], or float32 [S] in state mode.
+        """Returns the present frame: uint8 [H, W, 3], or float32 [S] in state mode.
 
-        It is what a replay stores for one time. After `set_simulator_state` it
-        shows the state that was set.
+        After `set_simulator_state` it shows the state that was set.
         """
         if self._current is None:
-            self._current = self._renderer.render() if self._renders else self._state()
+            self._current = self.renderer.render() if self._renders else self._state()
         return self._current.copy()
 
     def frame(self) -> np.ndarray:
-        """Returns the present image, uint8 [H, W, 3]; in state mode it is drawn now."""
-        return self.single_observation() if self._renders else self._renderer.render()
+        """Returns the present image, uint8 [H, W, 3], also in state mode."""
+        return self.single_observation() if self._renders else self.renderer.render()
 
     def simulator_state(self) -> dict[str, np.ndarray]:
         """Returns copies of `qpos`, `qvel` and `act`, each float64 and 1-D."""
@@ -202,19 +194,9 @@ class PixelEnvironment(dm_env.Environment):
         return None if math.isinf(limit) else math.ceil(limit / self._action_repeat)
 
     @property
-    def num_episodes_started(self) -> int:
-        """The number that `reset()` will give to the next episode."""
-        return self._num_episodes_started
-
-    @property
     def physics(self) -> Any:
         """The dm_control `Physics`."""
         return self._suite_environment.physics
-
-    @property
-    def renderer(self) -> Renderer:
-        """What draws this environment's images."""
-        return self._renderer
 
     def close(self) -> None:
         """Frees the simulation and its GL context."""
@@ -229,8 +211,7 @@ class PixelEnvironment(dm_env.Environment):
         single = self.single_observation()
         if not self._renders:
             return single
-        if not self._frames:
-            self._frames.extend([single] * (self._frames.maxlen or 1))
-        else:
-            self._frames.append(single)
-        return np.concatenate(self._frames, axis=2)
+        self._frames = [*(self._frames or [single] * self._frame_stack), single]
+        self._frames = self._frames[-self._frame_stack :]
+        indices = np.arange(self._frame_stack)[None]
+        return gather_stacks(np.stack(self._frames), indices)[0]

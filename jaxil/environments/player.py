@@ -101,8 +101,8 @@ class Player:
         self._waiting = dict(open_episodes or {})  # to be begun first
         self._open: dict[int, _Open] = {}  # by environment
 
-    def begin(self, wanted: Callable[[int], bool]) -> None:
-        """Starts an episode in each free environment.
+    def begin(self, wanted: Callable[[int], bool]) -> bool:
+        """Starts an episode in each free environment; returns whether any began.
 
         Args:
           wanted: asked for each new episode, by its number, whether to play it.
@@ -125,6 +125,7 @@ class Player:
                 if index in self._open:
                     self._step(index, action)
                     self._receive(index)
+        return bool(begun)
 
     @property
     def observations(self) -> np.ndarray:

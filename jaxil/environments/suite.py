@@ -1,7 +1,7 @@
-"""DeepMind Control tasks as an agent sees them: stacked camera frames.
+"""Makes environments of the DeepMind Control Suite.
 
-The only module that knows dm_control. `jaxil.machine.startup.prepare` has to run before
-it is used: the GL backend is chosen when dm_control is first imported.
+The only module that knows dm_control. Call `jaxil.machine.startup.prepare` first: the
+GL backend is chosen when dm_control is imported.
 """
 
 import difflib
@@ -13,7 +13,7 @@ from jaxil.environments.camera import Renderer
 from jaxil.environments.pixel_environment import PixelEnvironment
 
 OBSERVATIONS = ("pixels", "state")
-# Tasks whose camera 0 does not follow the body: DrQ-v2 looks through another one.
+# Where camera 0 does not follow the body, DrQ-v2 takes another one.
 _CAMERAS = {"quadruped": 2}
 
 
@@ -78,19 +78,17 @@ def make_environment(
     frame_stack: int = 3,
     render_quality: str = "paper",
     observation: str = "pixels",
-    camera: int | None = None,
 ) -> PixelEnvironment:
     """Makes the environment of `task`.
 
     Args:
-      task: `domain_task`, one of `known_tasks()`.
+      task: one of `known_tasks()`.
       seed: with an episode's number it fixes the episode's start. At least 0.
       action_repeat: environment frames per agent step.
       image_size: height and width in pixels.
       frame_stack: images per observation; without effect on states.
       render_quality: "paper", "fast" or "smooth".
       observation: "pixels" or "state".
-      camera: index of the camera; None takes the field's choice, `camera_of(task)`.
 
     Raises:
       ValueError: an argument is out of range.
@@ -115,7 +113,7 @@ def make_environment(
         suite_environment.physics,
         open_camera=_open_camera,
         image_size=image_size,
-        camera=camera_of(task) if camera is None else camera,
+        camera=camera_of(task),
         render_quality=render_quality,
     )
     return PixelEnvironment(

@@ -1,21 +1,23 @@
-"""Reading NumPy archives (.npz) that may be damaged, or made to do damage."""
+"""NumPy archives (.npz): read though they may be damaged or hostile, written whole."""
 
 import errno
 import io
 import math
 import os
 import pathlib
-import re
+import stat
 import struct
 import tempfile
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterable, Mapping
+from typing import BinaryIO
 
 import numpy as np
 
-MAX_MEMBER_BYTES = 2 * 1024**3
-# What zipfile raises for bytes that are not as they should be.
+MAX_BYTES = 2 * 1024**3
+# What zipfile raises for damaged bytes.
 _DAMAGES = (
     zipfile.BadZipFile,
     zlib.error,
@@ -23,20 +25,32 @@ _DAMAGES = (
     EOFError,
     RuntimeError,  # encrypted; and NotImplementedError, such as a later version
 )
-
-# How many bytes one compressed byte can stand for, at most.
+# Most bytes that one compressed byte can stand for.
 _MAX_RATIOS = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
-_LENGTH_FORMATS = {(1, 0): "<H", (2, 0): "<I"}  # of an .npy header, by version
-_HEADER = re.compile(
-    rb"\{'descr': '([<>|=][biufcSUVOmM]\d{0,9})', 'fortran_order': (?:True|False), "
-    rb"'shape': \(((?:\d{1,18}(?:, \d{1,18}){0,31},?)?)\), \} *\n"
-)
+_MAX_HEADER_BYTES = 2**14  # of an .npy file; NumPy evaluates at most 10000
+_HEADER_READERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+
+def open_regular(path: pathlib.Path) -> BinaryIO:
+    """Opens a regular file for reading; never waits for a pipe or reads a device.
+
+    Raises:
+      OSError: the file cannot be opened, or is not a regular file.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.ENOTSUP, "not a regular file", str(path))
+    return os.fdopen(descriptor, "rb")
 
 
 def member_names(path: pathlib.Path) -> frozenset[str]:
-    """Returns the names of an archive's arrays; none if it is no archive."""
+    """Returns the names of an archive's arrays; none if it is not an archive."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_regular(path) as file, zipfile.ZipFile(file) as archive:
             names = archive.namelist()
     except (OSError, ValueError, *_DAMAGES):
         return frozenset()
@@ -46,50 +60,55 @@ def member_names(path: pathlib.Path) -> frozenset[str]:
 def read_archive(
     path: pathlib.Path, *, max_bytes: Mapping[str, int]
 ) -> dict[str, np.ndarray]:
-    """Reads arrays of an archive; never unpickles, and never allocates unasked.
+    """Reads arrays of an archive; never unpickles.
 
-    The sizes that the archive and the arrays' headers declare are compared with each
-    other and with the limit before anything is unpacked.
+    All sizes are checked, from the headers of the archive and of its arrays, before
+    anything is unpacked.
 
     Args:
       path: the file.
-      max_bytes: names of the arrays to read, each with the largest size to accept,
-        in bytes, unpacked. Others in the file are not looked at.
+      max_bytes: names of the arrays to read, each with its largest unpacked size. All
+        together may take as much as the largest of these limits.
 
     Raises:
-      OSError: the file cannot be opened.
-      ValueError: says what is wrong with it, as the end of a sentence that begins
-        with the file's name.
+      OSError: the file cannot be opened, or is not a regular file.
+      ValueError: says what is wrong with the file, as the end of a sentence that begins
+        with its name.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            stored = {info.filename: info for info in archive.infolist()}
-            missing = [name for name in max_bytes if f"{name}.npy" not in stored]
-            if missing:
-                raise ValueError(f"has no array {', '.join(missing)}")
-            return {
-                name: _read_member(
-                    archive, stored[f"{name}.npy"], name, limit, path.stat().st_size
-                )
-                for name, limit in max_bytes.items()
-            }
-    except OSError as error:
-        if error.errno != errno.EINVAL:  # a place before the file's beginning
-            raise
-        raise ValueError(
-            "is cut off, damaged or no .npz file (a bad offset)"
-        ) from error
-    except _DAMAGES as error:
-        raise ValueError(f"is cut off, damaged or no .npz file ({error})") from error
+    budget, num_bytes = max(max_bytes.values(), default=0), 0
+    with open_regular(path) as file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                stored = {info.filename: info for info in archive.infolist()}
+                missing = [name for name in max_bytes if f"{name}.npy" not in stored]
+                if missing:
+                    raise ValueError(f"has no array {', '.join(missing)}")
+                members = {name: stored[f"{name}.npy"] for name in max_bytes}
+                file_bytes = os.fstat(file.fileno()).st_size
+                for name, info in members.items():
+                    _check_size(name, info, min(max_bytes[name], budget), file_bytes)
+                    num_bytes += info.file_size
+                if num_bytes > budget:
+                    raise ValueError(
+                        f"has arrays of {num_bytes} bytes in all ({', '.join(members)})"
+                        f", more than the {budget} that are accepted"
+                    )
+                for name, info in members.items():
+                    _check_header(archive, name, info)
+                return {name: _unpack(archive, info) for name, info in members.items()}
+        except OSError as error:
+            if error.errno != errno.EINVAL:  # an offset before the file's beginning
+                raise
+            raise ValueError(
+                "is cut off, damaged or no .npz file (a bad offset)"
+            ) from error
+        except _DAMAGES as error:
+            raise ValueError(
+                f"is cut off, damaged or no .npz file ({error})"
+            ) from error
 
 
-def _read_member(
-    archive: zipfile.ZipFile,
-    info: zipfile.ZipInfo,
-    name: str,
-    limit: int,
-    file_bytes: int,
-) -> np.ndarray:
+def _check_size(name: str, info: zipfile.ZipInfo, limit: int, file_bytes: int) -> None:
     if info.file_size > limit:
         raise ValueError(
             f"has an array {name} of {info.file_size} bytes, more than the {limit} "
@@ -97,67 +116,65 @@ def _read_member(
         )
     if info.compress_type not in _MAX_RATIOS:
         raise ValueError("is packed by a compression that is not read")
-    if (
-        info.compress_size > file_bytes
-        or info.file_size > info.compress_size * _MAX_RATIOS[info.compress_type]
-    ):
+    most_bytes = info.compress_size * _MAX_RATIOS[info.compress_type]
+    if info.compress_size > file_bytes or info.file_size > most_bytes:
         raise ValueError(f"has an array {name} that is not as long as it says")
-    # Asked for by its size: `read()` would unpack up to 2 GB before it looks.
+
+
+def _check_header(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> None:
     with archive.open(info) as member:
-        content = io.BytesIO(member.read(info.file_size))
+        start = io.BytesIO(member.read(_MAX_HEADER_BYTES))
     try:
-        shape, dtype = _read_header(content)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"has an unreadable array {name} ({error})") from error
+        version = np.lib.format.read_magic(start)
+        if version not in _HEADER_READERS:
+            raise ValueError(f"version {version} of the .npy format")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            shape, _, dtype = _HEADER_READERS[version](start)
+        is_plain = dtype.itemsize and not dtype.fields and not dtype.subdtype
+        if not is_plain or min(shape, default=0) < 0:
+            raise ValueError(f"shape {shape} of {dtype}")
+    except (
+        Exception
+    ) as error:  # NumPy evaluates an expression, which may raise anything
+        reason = f"not the header of a plain array: {str(error)[:100]}"
+        raise ValueError(f"has an unreadable array {name} ({reason})") from error
     if dtype.hasobject:
         raise ValueError(f"has an array {name} of Python objects, not of numbers")
-    num_bytes = math.prod(shape) * dtype.itemsize
-    if content.tell() + num_bytes != len(content.getbuffer()):
+    if start.tell() + math.prod(shape) * dtype.itemsize != info.file_size:
         raise ValueError(f"has an array {name} that is not as long as it says")
-    content.seek(0)
-    return np.lib.format.read_array(content, allow_pickle=False)
 
 
-def _read_header(content: io.BytesIO) -> tuple[tuple[int, ...], np.dtype]:
-    """Returns shape and type of an .npy file, which may not be all that Python knows.
-
-    NumPy's own function evaluates the header as an expression, and hostile ones make
-    it raise anything, or warn.
-    """
-    version = np.lib.format.read_magic(content)
-    if version not in _LENGTH_FORMATS:
-        raise ValueError(f"version {version} of the .npy format")
-    length_format = _LENGTH_FORMATS[version]
-    (length,) = struct.unpack(
-        length_format, content.read(struct.calcsize(length_format))
-    )
-    header = _HEADER.fullmatch(content.read(length))
-    if header is None:
-        raise ValueError("not the header of a plain array")
-    descr, sizes = (group.decode() for group in header.groups())
-    dtype = np.dtype(descr)
-    if dtype.itemsize == 0:
-        raise ValueError("its items have no size")
-    return tuple(int(size) for size in sizes.split(",") if size.strip()), dtype
+def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    with archive.open(info) as member, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return np.lib.format.read_array(member, allow_pickle=False)
 
 
-def write_archive(path: pathlib.Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
-    """Writes a compressed archive, whole or not at all.
+def write_archive(
+    path: pathlib.Path,
+    arrays: Iterable[tuple[str, np.ndarray]],
+    *,
+    compressed: bool = True,
+) -> None:
+    """Writes an archive under a temporary name, then renames it.
 
     Args:
       path: the file.
       arrays: pairs of a name and an array; taken one at a time, so that they need not
         all be in memory.
+      compressed: whether to spend time on a smaller file.
 
     Raises:
       OSError: the folder cannot be written.
     """
+    method = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, suffix=".part")
     temporary = pathlib.Path(name)
     try:
         with os.fdopen(handle, "wb") as file:
-            with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+            with zipfile.ZipFile(file, "w", method) as archive:
                 for name, array in arrays:
                     with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                         np.lib.format.write_array(member, array, allow_pickle=False)

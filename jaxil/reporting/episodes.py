@@ -3,12 +3,12 @@
 import functools
 import pathlib
 import re
-import zipfile
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from jaxil.files import archive
 from jaxil.reporting import plots
 from jaxil.reporting.groups import Group
 from jaxil.reporting.results import Study
@@ -18,6 +18,7 @@ from jaxil.reporting.sheets import Panel, Sheet
 _NAME = re.compile(r"frame_(\d+)\.mp4")
 # Browsers refuse pages of hundreds of megabytes; a suite episode has about one.
 _MAX_BYTES_EACH, _MAX_BYTES = 20_000_000, 100_000_000
+_STORED = {"imitation_rewards", "task_rewards", "plan"}  # beside a video
 _REWARD_HEIGHT, _PLAN_HEIGHT = 1.75, 3.4  # inches
 
 
@@ -110,8 +111,9 @@ def _sheet(
 ) -> Sheet | None:
     """Draws what is stored beside a video; None if nothing is."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {key: np.asarray(stored[key], np.float64) for key in stored.files}
+        names = _STORED & archive.member_names(path)
+        stored = archive.read_archive(path, max_bytes=dict.fromkeys(names, 2**26))
+        arrays = {name: np.asarray(each, np.float64) for name, each in stored.items()}
         imitation = arrays.get("imitation_rewards", np.zeros(0))
         task = arrays.get("task_rewards", np.zeros(0))
         plan = arrays.get("plan", np.zeros((0, 0)))
@@ -119,7 +121,7 @@ def _sheet(
             raise ValueError("wrong number of axes")
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, TypeError) as error:
         left_out.append(f"{path} is left out: it can't be read ({error})")
         return None
     panels = []

@@ -135,8 +135,6 @@ def make_player(
         environments = Pool(
             make,
             config.num_environments,
-            observation=environment.reset(episode=0).observation,
-            frame=environment.single_observation(),
             say=say,
         )
     return Player(

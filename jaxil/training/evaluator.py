@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxil.config import Config
-from jaxil.environments.evaluation import Evaluation, evaluate
+from jaxil.environments.evaluation import Evaluation, Stopped, evaluate
 from jaxil.environments.suite import PixelEnvironment
 from jaxil.learner.state import TrainState
 from jaxil.maths.types import Episode, ExpertEpisodes
@@ -65,7 +65,6 @@ class Evaluator:
         Returns:
           None if it was stopped.
         """
-        del stop_asked
         config = self._config
         encoder, actor, _ = state.params
 
@@ -75,13 +74,17 @@ class Evaluator:
             )[0]
 
         every = config.video_every_evals
-        evaluation = evaluate(
-            self.environment,
-            act,
-            num_episodes=config.num_eval_episodes,
-            first_episode=number * config.num_eval_episodes,
-            record_video=every > 0 and (number % every == 0 or is_last),
-        )
+        try:
+            evaluation = evaluate(
+                self.environment,
+                act,
+                num_episodes=config.num_eval_episodes,
+                first_episode=number * config.num_eval_episodes,
+                record_video=every > 0 and (number % every == 0 or is_last),
+                stop_asked=stop_asked,
+            )
+        except Stopped:
+            return None
         distance, filmed = None, {}
         if self._distance is not None:
             distance = self._distance.relative_distance(evaluation.episodes)

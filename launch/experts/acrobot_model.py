@@ -1,4 +1,4 @@
-"""The equations of motion of the suite's acrobot, for many states at once."""
+"""The equations of motion of the suite's acrobot."""
 
 from typing import Any
 
@@ -46,10 +46,7 @@ class Arm:
     def step(self, state: tuple, action: np.ndarray, num_frames: int = 1) -> tuple:
         """Returns the state after so many frames, as one Runge-Kutta step of order 4.
 
-        Args:
-          state: see the class.
-          action: Shape [N], in [-1, 1].
-          num_frames: 1 is what the simulator does.
+        Actions [N] lie in [-1, 1]; one frame is what the simulator does.
         """
         q1, q2, v1, v2 = state
         torque, h = self._gear * action, self._frame_seconds * num_frames

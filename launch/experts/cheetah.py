@@ -5,29 +5,24 @@ r"""Records demonstrations of cheetah_run by a learned policy that thinks ahead.
 
 Policies on state vectors stop near three quarters of the greatest speed for millions of
 frames. So each decision starts from what the policy would do for ten more, tries 768
-other sequences in the simulator, adds the critic's value of where each ends, and does
+other sequences in the simulator, adds the critic's value of each final state, and takes
 the best one's first action. One core needs some 40 seconds per episode.
 """
 
 import pathlib
-import sys
-import time
 from typing import Any
 
 import numpy as np
 import studio
-from cheetah_search import Effort, Judge, Simulator, search
-
-from jaxil.machine import startup
+from cheetah_search import Effort, Judge, Planner, Simulator
 
 TASK = "cheetah_run"
-EFFORT = Effort()
 
 
-def record(folder: pathlib.Path, num_episodes: int, *, effort: Effort = EFFORT) -> Any:
-    """Plays episodes and returns them as `StateDemonstrations`.
-
-    Each episode's draws depend on its number alone. Progress goes to stderr.
+def record(
+    folder: pathlib.Path, num_episodes: int, effort: Effort | None = None
+) -> Any:
+    """Returns K episodes as `StateDemonstrations`.
 
     Args:
       folder: of a run on the task's state vectors; its newest checkpoint is taken.
@@ -37,53 +32,43 @@ def record(folder: pathlib.Path, num_episodes: int, *, effort: Effort = EFFORT) 
     Raises:
       UsageError: there is no such run.
     """
-    judge, config, about = load_judge(folder)
-    began_cpu = time.process_time()
-    environment = studio.make_environment(TASK)
-    simulator = Simulator(environment.physics)
+    effort = effort or Effort()
+    judge, discount, about = _load_judge(folder)
 
-    def begin(episode: int) -> studio.Decide:
-        rng = np.random.default_rng([studio.SEED, episode])
-        plan: np.ndarray | None = None
+    def prepare(environment: Any) -> Any:
+        simulator = Simulator(environment.physics)
+        planner = Planner(simulator, judge, discount, effort)
 
-        def decide(step: int) -> np.ndarray:
-            nonlocal plan
-            del step
-            plan = search(
-                simulator,
-                judge,
-                simulator.now(),
-                plan,
-                effort,
-                config.discount_factor,
-                rng,
-            )
-            return plan[0]
+        def begin(episode: int) -> Any:
+            rng = np.random.default_rng([studio.SEED, episode])
+            plan: np.ndarray | None = None
 
-        return decide
+            def decide(step: int, observation: np.ndarray) -> np.ndarray:
+                nonlocal plan
+                del step, observation
+                plan = planner.search(simulator.now(), plan, rng)
+                return plan[0]
 
-    arrays = studio.play(environment, begin, num_episodes)
-    environment.close()
-    return studio.demonstrations(
+            return decide
+
+        return begin
+
+    return studio.record(
         TASK,
-        arrays,
+        prepare,
+        num_episodes,
         f"{about}, improved by search with the simulator: at each decision "
         f"{effort.rounds} rounds of {effort.candidates} sequences of {effort.horizon} "
-        "actions, judged by their rewards and the critic's value of their end; "
-        f"{(time.process_time() - began_cpu) / 60:.0f} minutes of one core; no noise",
+        "actions, judged by their rewards and the critic's value of their end",
     )
 
 
-def load_judge(folder: pathlib.Path) -> tuple[Judge, Any, str]:
-    """Returns policy and values of a run, its config, and a few words on it.
-
-    Raises:
-      UsageError: there is no run of the task on state vectors, or no checkpoint.
-    """
+def _load_judge(folder: pathlib.Path) -> tuple[Judge, float, str]:
+    """Returns policy and values of a run, its discount factor, and its description."""
     import jax
     import jax.numpy as jnp
 
-    from jaxil.errors import UsageError
+    from jaxil.command import UsageError
     from jaxil.networks.agent import apply
     from jaxil.training import assembly, trained, workdir
 
@@ -109,13 +94,12 @@ def load_judge(folder: pathlib.Path) -> tuple[Judge, Any, str]:
 
     return (
         lambda observations: jax.tree.map(np.asarray, judge(observations)),
-        config,
+        config.discount_factor,
         run.description(),
     )
 
 
-def main(argv: list[str]) -> None:
-    """Runs the command."""
+if __name__ == "__main__":
     parser = studio.Parser(__doc__)
     parser.add_argument(
         "--workdir",
@@ -123,19 +107,4 @@ def main(argv: list[str]) -> None:
         required=True,
         help="folder of a run of configs/expert.py:cheetah_run",
     )
-    values = parser.parse_args(argv)
-    print(startup.prepare(), file=sys.stderr, flush=True)
-    from jaxil.errors import UsageError
-
-    try:
-        studio.write(
-            parser,
-            values.output,
-            lambda: record(values.workdir, values.num_episodes),
-        )
-    except UsageError as error:
-        parser.error(str(error))
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
+    studio.run(parser, lambda values: record(values.workdir, values.num_episodes))

@@ -1,4 +1,4 @@
-"""A search for actions with the simulator, led by a learned policy and its values."""
+"""Searches for actions in the simulator, guided by a learned policy and its values."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,23 +16,14 @@ Judge = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class Effort(NamedTuple):
-    """How long a decision is thought about.
+    """How much is tried for one decision."""
 
-    Attributes:
-      horizon: H, decisions that are simulated.
-      candidates: N, sequences of H actions in each round.
-      rounds: of drawing around the best sequences of the round before.
-      spread: standard deviation of the first round's draws.
-      elites: sequences that the next round is drawn around.
-      temperature: of their weights, in units of return.
-    """
-
-    horizon: int = 10
-    candidates: int = 64
-    rounds: int = 12
-    spread: float = 0.4
-    elites: int = 8
-    temperature: float = 0.1
+    horizon: int = 10  # H, decisions that are simulated
+    candidates: int = 64  # N, sequences of H actions in each round
+    rounds: int = 12  # of sampling around the best sequences of the round before
+    spread: float = 0.4  # standard deviation in the first round
+    elites: int = 8  # sequences that the next round is sampled around
+    temperature: float = 0.1  # of their weights, in units of return
 
 
 class Simulator:
@@ -57,11 +48,7 @@ class Simulator:
     def run(
         self, state: np.ndarray, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Tries sequences of actions.
-
-        Args:
-          state: where all of them start, shape [P].
-          actions: shape [N, H, A], in [-1, 1].
+        """Tries sequences of actions [N, H, A] in [-1, 1] from one state [P].
 
         Returns:
           States after each decision [N, H, P], and rewards [N, H]: a step's speed is
@@ -81,86 +68,65 @@ class Simulator:
         return np.concatenate(parts, axis=-1).astype(np.float32)
 
 
-def follow(
-    simulator: Simulator, judge: Judge, state: np.ndarray, horizon: int
-) -> np.ndarray:
-    """Returns what the policy would do from a state on, shape [H, A]."""
-    actions = []
-    for _ in range(horizon):
-        action = judge(simulator.observe(state)[None])[0]
-        state = simulator.run(state, action[None])[0][0, -1]
-        actions.append(action[0])
-    return np.stack(actions)
+class Planner(NamedTuple):
+    """Improves on a policy by trying sequences of actions.
 
+    Attributes:
+      simulator: what they are tried in.
+      judge: policy and values.
+      discount: gamma.
+      effort: how much is tried.
+    """
 
-def score(
-    simulator: Simulator,
-    judge: Judge,
-    state: np.ndarray,
-    actions: np.ndarray,
-    discount: float,
-) -> np.ndarray:
-    """Returns the discounted rewards of sequences, and the value of where they end.
+    simulator: Simulator
+    judge: Judge
+    discount: float
+    effort: Effort
+
+    def follow(self, state: np.ndarray) -> np.ndarray:
+        """Returns what the policy would do from a state on, shape [H, A]."""
+        actions = []
+        for _ in range(self.effort.horizon):
+            action = self.judge(self.simulator.observe(state)[None])[0]
+            state = self.simulator.run(state, action[None])[0][0, -1]
+            actions.append(action[0])
+        return np.stack(actions)
+
+    def score(self, state: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """Returns the predicted return [N] of sequences of actions [N, H, A].
 
         sum_{t<H} gamma^t r_t + gamma^H min_k Q_k(s_H, pi(s_H))
+        """
+        states, rewards = self.simulator.run(state, actions)
+        gamma, horizon = self.discount, actions.shape[1]
+        values = self.judge(self.simulator.observe(states[:, -1]))[1]
+        return rewards @ gamma ** np.arange(horizon) + gamma**horizon * values
 
-    Args:
-      simulator: what they are tried in.
-      judge: policy and values.
-      state: where they start.
-      actions: shape [N, H, A].
-      discount: gamma.
+    def search(
+        self, state: np.ndarray, plan: np.ndarray | None, rng: np.random.Generator
+    ) -> np.ndarray:
+        """Returns a sequence of actions [H, A] that is better than the policy's.
 
-    Returns:
-      Shape [N].
-    """
-    states, rewards = simulator.run(state, actions)
-    horizon = actions.shape[1]
-    values = judge(simulator.observe(states[:, -1]))[1]
-    return rewards @ discount ** np.arange(horizon) + discount**horizon * values
-
-
-def search(
-    simulator: Simulator,
-    judge: Judge,
-    state: np.ndarray,
-    plan: np.ndarray | None,
-    effort: Effort,
-    discount: float,
-    rng: np.random.Generator,
-) -> np.ndarray:
-    """Returns a sequence of actions that is better than the policy's.
-
-    The cross-entropy method, weighted as in MPPI: each round draws around the weighted
-    mean of the round before; the policy's own sequence is always a candidate.
-
-    Args:
-      simulator: what they are tried in.
-      judge: policy and values.
-      state: where they start.
-      plan: the last decision's result; None at an episode's start.
-      effort: how much is tried.
-      discount: gamma.
-      rng: of the draws.
-
-    Returns:
-      Shape [H, A], of which the first is to be done.
-    """
-    usual = follow(simulator, judge, state, effort.horizon)
-    mean = usual if plan is None else np.concatenate([plan[1:], usual[-1:]])
-    spread = np.full(mean.shape, effort.spread)
-    for _ in range(effort.rounds):
-        drawn = rng.standard_normal((effort.candidates, *mean.shape))
-        candidates = mean + spread * drawn
-        few = effort.candidates // 4
-        candidates[:few] = usual + effort.spread * drawn[:few]
-        candidates[0], candidates[1] = usual, mean
-        candidates = np.clip(candidates, -1.0, 1.0)
-        scores = score(simulator, judge, state, candidates, discount)
-        best = np.argsort(-scores)[: effort.elites]
-        weights = np.exp((scores[best] - scores[best[0]]) / effort.temperature)
-        weights = (weights / weights.sum())[:, None, None]
-        mean = np.sum(weights * candidates[best], axis=0)
-        variance = np.sum(weights * np.square(candidates[best] - mean), axis=0)
-        spread = np.clip(np.sqrt(variance), 0.05, effort.spread)
-    return mean
+        The cross-entropy method, weighted as in MPPI: each round samples around the
+        weighted mean of the round before; the policy's own sequence is always a
+        candidate. `plan` is the last decision's result; None at an episode's start.
+        """
+        effort = self.effort
+        usual = self.follow(state)
+        mean = usual if plan is None else np.concatenate([plan[1:], usual[-1:]])
+        spread = np.full(mean.shape, effort.spread)
+        for _ in range(effort.rounds):
+            noise = rng.standard_normal((effort.candidates, *mean.shape))
+            candidates = mean + spread * noise
+            few = effort.candidates // 4
+            candidates[:few] = usual + effort.spread * noise[:few]
+            candidates[0], candidates[1] = usual, mean
+            candidates = np.clip(candidates, -1.0, 1.0)
+            scores = self.score(state, candidates)
+            best = np.argsort(-scores)[: effort.elites]
+            weights = np.exp((scores[best] - scores[best[0]]) / effort.temperature)
+            weights = (weights / weights.sum())[:, None, None]
+            mean = np.sum(weights * candidates[best], axis=0)
+            variance = np.sum(weights * np.square(candidates[best] - mean), axis=0)
+            spread = np.clip(np.sqrt(variance), 0.05, effort.spread)
+        return mean

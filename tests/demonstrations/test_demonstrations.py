@@ -2,6 +2,8 @@
 
 import json
 import logging
+import os
+import pathlib
 import zipfile
 
 import numpy as np
@@ -173,19 +175,27 @@ def test_images_are_drawn_once_for_each_view(path, monkeypatch):
     np.testing.assert_array_equal(load(path).frames, FRAMES)
 
 
-@pytest.mark.parametrize("damage", ["cut", "empty", "other shape", "no array"])
-def test_damaged_cache_entries_are_drawn_again(path, tmp_path, damage):
+@pytest.mark.parametrize(
+    "damage", ["cut", "empty", "flipped byte", "other shape", "no array", "other file"]
+)
+def test_damaged_cache_entries_are_rendered_again(path, tmp_path, damage):
     load(path)
-    entry = min((tmp_path / "cache" / "frames").glob("*.npy"))
+    entry = min((tmp_path / "cache" / "frames").glob("*.npz"))
     if damage == "cut":
         entry.write_bytes(entry.read_bytes()[:-10])
     elif damage == "empty":
         entry.write_bytes(b"")
+    elif damage == "flipped byte":
+        content = bytearray(entry.read_bytes())
+        content[len(content) // 2] ^= 1  # amid the pixels
+        entry.write_bytes(bytes(content))
     elif damage == "other shape":
-        np.save(entry, np.zeros(3, np.uint8))
+        np.savez(entry, images=np.zeros(3, np.uint8))
+    elif damage == "no array":
+        np.savez(entry, x=np.zeros(3))
     else:
-        np.savez(entry.with_suffix(".npz"), x=np.zeros(3))
-        entry.with_suffix(".npz").replace(entry)
+        with entry.open("wb") as file:
+            np.save(file, np.zeros(3))
     np.testing.assert_array_equal(load(path).frames, FRAMES)
     assert drawn_images(path) == 0
     assert not list(entry.parent.glob("*.part"))
@@ -330,10 +340,27 @@ def test_a_file_that_cannot_be_opened(tmp_path, folder):
         states.read_states(path)
 
 
-def test_members_that_would_fill_the_memory_are_not_unpacked(path, monkeypatch):
-    monkeypatch.setattr(archive, "MAX_MEMBER_BYTES", 300)
+def test_arrays_that_would_fill_the_memory_are_not_unpacked(path, monkeypatch):
+    monkeypatch.setattr(archive, "MAX_BYTES", 300)
     with pytest.raises(DemonstrationError, match=r"qpos of .* more than the 300"):
         states.read_states(path)
+    # Each by itself is within the limit.
+    monkeypatch.setattr(archive, "MAX_BYTES", 1000)
+    monkeypatch.setattr(states, "_MAX_METADATA_BYTES", 1000)
+    tampered(path, lambda arrays: set_metadata(arrays, expert="", versions={}))
+    with pytest.raises(DemonstrationError, match=r"in all .* more than the 1000"):
+        states.read_states(path)
+
+
+@pytest.mark.parametrize("use", [load, loading.check])
+def test_a_pipe_or_a_device_is_refused_at_once(use, tmp_path):
+    pipe = tmp_path / "pipe.npz"
+    os.mkfifo(pipe)
+    for path in (pipe, pathlib.Path("/dev/zero")):
+        with pytest.raises(DemonstrationError, match="neither a file nor a folder"):
+            use(path, **{"task": TASK, "num_episodes": 1, "action_repeat": 2})
+        with pytest.raises(DemonstrationError, match="not a regular file"):
+            states.read_states(path)
 
 
 def test_a_header_that_promises_more_than_there_is(path):
@@ -465,24 +492,3 @@ def test_shipped_actions_played_again_lead_to_the_stored_states(task):
         **VIEW,
     )
     assert (drawn[0] != np.stack(frames)).mean() < 1e-3
-
-
-def test_sampled_stacks_are_those_of_an_episode_with_the_actions_taken_there():
-    frames = np.arange(2 * 4, dtype=np.uint8).reshape(2, 4, 1, 1, 1)
-    frames = np.repeat(frames, 3, axis=-1)  # episode e, time t holds 4 e + t
-    actions = np.arange(2 * 3, dtype=np.float32).reshape(2, 3, 1)
-    demos = loading.Demonstrations(
-        frames, np.array([4, 4]), actions, actions[..., 0], {}
-    )
-    observation, action = loading.sample(
-        demos, np.random.default_rng(0), 200, frame_stack=3
-    )
-    expected = {
-        float(actions[e, t, 0]): [4 * e + max(t - age, 0) for age in (2, 1, 0)]
-        for e in range(2)
-        for t in range(3)
-    }
-    assert set(action[:, 0].tolist()) == set(expected)
-    for stack, taken in zip(observation, action[:, 0].tolist(), strict=True):
-        assert stack.shape == (1, 1, 9)
-        assert stack[0, 0, ::3].tolist() == expected[taken]

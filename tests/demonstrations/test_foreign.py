@@ -264,7 +264,7 @@ def test_what_cannot_match_is_said(path, caplog):
         load(path)
     assert "12x6 pixels are resized to 8x8, squeezed" in caplog.text
     assert "action_repeat=4, and the run has 2" in caplog.text
-    assert "25 frames per second, and the agent decides 50 times" in caplog.text
+    assert "25 frames per second, and the agent makes 50 steps" in caplog.text
     assert "Made from: a test" in caplog.text
 
 

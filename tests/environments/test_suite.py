@@ -7,6 +7,7 @@ from dm_control import suite as dm_suite
 from dm_env import specs
 
 from jaxil.environments import suite
+from jaxil.environments.interaction import Environment
 from jaxil.environments.suite import PixelEnvironment, make_environment
 
 SIZE = 24
@@ -284,7 +285,6 @@ def test_cameras_are_those_of_the_field():
         ({"frame_stack": 0}, "frame_stack=0 must be at least 1"),
         ({"seed": -1}, "seed=-1 must be at least 0"),
         ({"observation": "sound"}, "pixels, state"),
-        ({"camera": 9}, "camera=9 does not exist"),
     ],
 )
 def test_faults_name_value_and_rule(changes, message):
@@ -308,3 +308,9 @@ def test_no_gl_is_said_with_a_way_out(monkeypatch):
     environment = small()
     with pytest.raises(RuntimeError, match=r"No OpenGL .*jaxil\.doctor"):
         environment.reset()
+
+
+def test_it_is_all_that_the_loop_needs():
+    environment: Environment = small()
+    assert isinstance(environment, Environment)
+    assert not isinstance(environment.action_spec(), Environment)

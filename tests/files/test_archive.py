@@ -1,6 +1,9 @@
 """Archives that ask for more of zipfile than it can do are refused in words."""
 
+import os
+import pathlib
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -57,4 +60,51 @@ def test_an_archive_of_a_later_version(path):
     alter(path, VERSION, 99)
     with pytest.raises(ValueError, match=r"damaged or no .npz.*zip file version 9\.9"):
         read(path)
+    assert archive.member_names(path) == frozenset()
+
+
+def test_all_arrays_together_are_bounded_before_any_is_unpacked(tmp_path):
+    path, size = tmp_path / "many.npz", 4_000_000
+    zeros = np.zeros(size, np.uint8)
+    archive.write_archive(path, [(f"array{index}", zeros) for index in range(5)])
+    assert path.stat().st_size < 50_000
+    limits = {f"array{index}": size + 200 for index in range(5)}  # each by itself fits
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match=f"in all .* more than the {size + 200}"):
+            archive.read_archive(path, max_bytes=limits)
+        assert tracemalloc.get_traced_memory()[1] < 1_000_000
+    finally:
+        tracemalloc.stop()
+    limits["array0"] = 6 * size  # the largest of the limits is that of all together
+    assert len(archive.read_archive(path, max_bytes=limits)) == 5
+
+
+def test_a_flipped_byte_is_noticed_or_without_effect(tmp_path):
+    path = tmp_path / "numbers.npz"
+    numbers = np.arange(40.0)
+    archive.write_archive(path, [("numbers", numbers)], compressed=False)
+    content = path.read_bytes()
+    num_refused = 0
+    for place in range(0, len(content)):
+        damaged = bytearray(content)
+        damaged[place] ^= 0x10
+        path.write_bytes(bytes(damaged))
+        try:
+            found = archive.read_archive(path, max_bytes={"numbers": 1000})["numbers"]
+        except ValueError:
+            num_refused += 1
+        else:
+            np.testing.assert_array_equal(found, numbers)
+    assert num_refused > numbers.nbytes
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
+def test_only_regular_files_are_opened(kind, tmp_path):
+    path = {"device": pathlib.Path("/dev/zero"), "folder": tmp_path}.get(kind)
+    if path is None:
+        path = tmp_path / "pipe"
+        os.mkfifo(path)
+    with pytest.raises(OSError, match="not a regular file"):
+        archive.read_archive(path, max_bytes={"numbers": 1000})
     assert archive.member_names(path) == frozenset()

@@ -1,0 +1,249 @@
+"""Rendering by several processes: the same images and files, whatever happens."""
+
+import logging
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from jaxil.demonstrations import rendering
+from jaxil.environments.suite import make_environment
+from tests.commands import ROOT
+
+TASK = "finger_turn_hard"  # its target is not part of the simulator's state
+SEED, FIRST, EPISODES, LENGTH, SIZE = 5, 3, 3, 20, 24
+TOTAL = EPISODES * LENGTH
+
+
+def make_states():
+    environment = make_environment(TASK, seed=SEED, observation="state")
+    rng = np.random.default_rng(0)
+    widths = {name: len(value) for name, value in environment.simulator_state().items()}
+    environment.close()
+    return {
+        name: rng.normal(size=(EPISODES, LENGTH, width))
+        for name, width in widths.items()
+    }
+
+
+STATES = make_states()
+
+
+def observe(progress=None, processes: int | None = 1, states=STATES):
+    return rendering.observe_episodes(
+        states,
+        task=TASK,
+        seed=SEED,
+        first_episode=FIRST,
+        image_size=SIZE,
+        render_quality="fast",
+        progress=progress,
+        processes=processes,
+    )
+
+
+@pytest.fixture(name="alone", scope="module")
+def _alone(tmp_path_factory):
+    """Images and cached files of one process."""
+    folder = tmp_path_factory.mktemp("alone")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAXIL_CACHE", str(folder))
+        images = observe()
+    assert len(np.unique(images.reshape(TOTAL, -1), axis=0)) == TOTAL
+    return images, pixels_in(folder)
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAXIL_CACHE", str(tmp_path / "cache"))
+
+
+def pixels_in(folder):
+    found = {}
+    for path in (folder / "frames").iterdir():
+        with np.load(path) as stored:
+            found[path.name] = stored["images"].tobytes()
+    return found
+
+
+def children(pid: int | str = "self") -> list[int]:
+    """Returns processes of multiprocessing, which a process has started."""
+    tasks = pathlib.Path(f"/proc/{pid}/task").iterdir()
+    words = " ".join((task / "children").read_text() for task in tasks).split()
+    commands = {int(w): pathlib.Path(f"/proc/{w}/cmdline").read_text() for w in words}
+    return [pid for pid, command in commands.items() if "spawn_main" in command]
+
+
+def test_two_processes_render_what_one_renders(alone, tmp_path, caplog):
+    calls, libraries = [], set()
+
+    def progress(done, total):
+        calls.append((done, total))
+        for pid in children():
+            maps = pathlib.Path(f"/proc/{pid}/maps").read_text()
+            libraries.update(name for name in ("mujoco", "jaxlib") if name in maps)
+
+    np.testing.assert_array_equal(observe(progress, processes=2), alone[0])
+    assert pixels_in(tmp_path / "cache") == alone[1]
+    assert len(alone[1]) == EPISODES
+    assert calls == [(LENGTH * (number + 1), TOTAL) for number in range(EPISODES)]
+    assert libraries == {"mujoco"}, "jax takes seconds and memory"
+    assert not children()
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_lost_processes_are_done_without(number, alone, tmp_path, caplog, monkeypatch):
+    calls = []
+    if number == signal.SIGSTOP:
+        monkeypatch.setattr(rendering, "_SILENCE_SECONDS", 3.0)
+
+    def lose():
+        while len(pids := children()) < 2:
+            time.sleep(0.01)
+        for pid in pids:
+            os.kill(pid, number)
+
+    thread = threading.Thread(target=lose)
+    thread.start()
+    with caplog.at_level(logging.WARNING):
+        images = observe(lambda *call: calls.append(call), processes=2)
+    thread.join()
+    np.testing.assert_array_equal(images, alone[0])
+    assert pixels_in(tmp_path / "cache") == alone[1]
+    assert calls == [(done + 1, TOTAL) for done in range(TOTAL)]
+    (record,) = caplog.records
+    said = "terminated" if number == signal.SIGKILL else "no episode in 3 s"
+    assert said in record.getMessage()
+    assert not children()
+
+
+@pytest.mark.parametrize("fault", ["another renderer", "no process"])
+def test_processes_that_cannot_render_are_done_without(
+    fault, alone, caplog, monkeypatch
+):
+    if fault == "no process":
+
+        def submit(*_):
+            raise BlockingIOError("no more processes")
+
+        executor = rendering.concurrent.futures.ProcessPoolExecutor
+        monkeypatch.setattr(executor, "submit", submit)
+    else:
+        real = rendering._render_together
+        monkeypatch.setattr(
+            rendering,
+            "_render_together",
+            lambda processes, episodes, settings, _: real(
+                processes, episodes, settings, "a GPU"
+            ),
+        )
+    np.testing.assert_array_equal(observe(processes=2), alone[0])
+    said = {"another renderer": "not with a GPU", "no process": "no more processes"}
+    assert said[fault] in caplog.text
+    assert not children()
+
+
+def test_states_of_another_model_are_refused():
+    states = {**STATES, "qpos": STATES["qpos"][..., :-1]}
+    for processes in (1, None):
+        with pytest.raises(ValueError, match="qpos has shape"):
+            observe(processes=processes, states=states)
+
+
+_SCRIPT = """
+import sys
+from tests.demonstrations import test_rendering
+
+def progress(done, total):
+    print(*test_rendering.children(), flush=True)
+    sys.stdin.readline()
+
+try:  # not guarded by __name__: a process must not come here again
+    test_rendering.observe(progress, processes=2)
+except KeyboardInterrupt:
+    print("stopped", flush=True)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_parent_that_is_stopped_leaves_nothing(number, alone, tmp_path):
+    script = tmp_path / "parent.py"
+    script.write_text(_SCRIPT)
+    parent = subprocess.Popen(
+        [sys.executable, str(script)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert parent.stdout is not None
+    pids = [int(word) for word in parent.stdout.readline().split()]
+    assert len(pids) == 2
+    if number == signal.SIGINT:
+        os.killpg(parent.pid, number)  # as a terminal does it
+    else:
+        parent.kill()
+    rest, errors = parent.communicate(timeout=60)
+    end = time.monotonic() + 30
+    while any(map(is_there, pids)):
+        assert time.monotonic() < end, "processes were left behind"
+        time.sleep(0.05)
+    if number == signal.SIGINT:
+        assert rest == "stopped\n"
+        assert errors == ""
+    assert not list((tmp_path / "cache").rglob("*.part"))
+    found = pixels_in(tmp_path / "cache")
+    assert found.items() <= alone[1].items()
+    assert found, "the first episode was whole"
+
+
+def is_there(pid):
+    try:
+        status = pathlib.Path(f"/proc/{pid}/stat").read_text().rsplit(")")[-1]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return status.split()[0] != "Z"  # dead, and its new parent has not looked yet
+
+
+@pytest.mark.parametrize(
+    ("cores", "gl_name", "num_pixels", "expected"),
+    [
+        (2, "llvmpipe (LLVM 15.0.6, 256 bits)", 10**8, 2),
+        (64, "llvmpipe (LLVM 15.0.6, 256 bits)", 10**8, 8),
+        (64, "softpipe", 10**8, 8),
+        (1, "softpipe", 10**8, 1),
+        (2, "softpipe", 10**5, 1),
+        (64, "NVIDIA H100 80GB HBM3/PCIe/SSE2", 10**8, 1),
+    ],
+)
+def test_how_many_processes_pay(cores, gl_name, num_pixels, expected, monkeypatch):
+    monkeypatch.setattr(rendering.os, "sched_getaffinity", lambda _: set(range(cores)))
+    assert rendering.how_many(num_pixels, gl_name) == expected
+
+
+@pytest.mark.parametrize("pays", [True, False])
+def test_processes_are_started_where_they_pay(pays, alone, monkeypatch):
+    started = []
+    real = rendering._render_together
+
+    def render_together(*values):
+        started.append(values[0])
+        return real(*values)
+
+    monkeypatch.setattr(rendering, "_render_together", render_together)
+    monkeypatch.setattr(rendering, "_SOFTWARE", ("",))  # every renderer
+    monkeypatch.setattr(rendering.os, "sched_getaffinity", lambda _: {0, 1})
+    num_pixels = TOTAL * SIZE**2
+    monkeypatch.setattr(rendering, "_WORTH_PIXELS", num_pixels + (not pays))
+    np.testing.assert_array_equal(observe(processes=None), alone[0])
+    assert started == [2] * pays
