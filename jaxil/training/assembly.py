@@ -32,7 +32,7 @@ from jaxil.learner.update import (
     init_train_state,
     make_update_step,
 )
-from jaxil.machine import startup
+from jaxil.machine import memory
 from jaxil.machine.progress import ProgressLine
 from jaxil.maths.types import ExpertEpisodes
 from jaxil.native import build, encoding
@@ -49,7 +49,6 @@ from jaxil.rewarders.task import make_task_rewarder, make_zero_rewarder
 _EVALUATION_SEED = 1_000_003
 # A fault in one of these leaves no sense in opening the demonstrations.
 _READING_FIELDS = ("demonstrations.", "image_size", "action_repeat", "observation")
-_ASSUMED_MEMORY = 4 * 2**30  # bytes, where the machine doesn't tell
 
 
 class Agent(NamedTuple):
@@ -230,17 +229,8 @@ def _file_settings(config: Config) -> dict[str, Any]:
         "image_size": config.image_size,
         "observation": config.observation,
         "frame_skip": config.demonstrations.frame_skip,
-        "max_bytes": spare_bytes(),
+        "max_bytes": memory.spare_bytes(),
     }
-
-
-def spare_bytes() -> int:
-    """Returns how much memory demonstrations may take: half of what is available.
-
-    In whole GiB, so that a file read twice is read under the same limit.
-    """
-    available = startup.available_memory_bytes() or _ASSUMED_MEMORY
-    return max(available // 2 // 2**30, 1) * 2**30
 
 
 def make_replay(config: Config, environment: PixelEnvironment) -> Replay:
