@@ -37,7 +37,7 @@ def main(argv: list[str]) -> None:
     faults = assembly.problems(values.config) + _flag_problems(values)
     if faults:
         raise command.UsageError(command.listing(faults))
-    settings = {name: values[name].value for name in ("repeats", "steps", "full")}
+    settings: Any = {name: values[name].value for name in ("repeats", "steps", "full")}
     if values.sweep is not None:
         results: Any = []
         field, configs = _swept(values.sweep, values.config)

@@ -125,17 +125,19 @@ def comparison_table(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """Names what else differs: device, machine, fields of the config."""
     before, now = (
-        {name: each[name] for name in _CIRCUMSTANCES if name in old and name in each}
-        | flatten_dict(
-            {"config": json.loads(json.dumps(each["config"]))},
-            sep=".",
-        )
+        {name: repr(each.get(name)) for name in _CIRCUMSTANCES if name in old}
+        | {
+            name: repr(value)
+            for name, value in flatten_dict(
+                {"config": json.loads(json.dumps(each["config"]))}, sep="."
+            ).items()
+        }
         for each in (old, new)
     )
     return [
-        f"{name}: {before.get(name, 'absent')!r} then, {now.get(name, 'absent')!r} now"
-        for name in dict.fromkeys([*before, *sorted(now)])
-        if name not in before or name not in now or before[name] != now[name]
+        f"{name}: {before.get(name, 'absent')} then, {now.get(name, 'absent')} now"
+        for name in dict.fromkeys([*before, *now])
+        if before.get(name) != now.get(name)
     ]
 
 
