@@ -46,11 +46,10 @@ class Finding(NamedTuple):
 
 
 def examine(config: Any) -> Iterator[Finding]:
-    """Runs all checks for a run of `config`; None where it could not be read."""
-    for check in (
-        *(versions, gl_libraries, rendering, jax_devices),
-        *(convolutions, memory, demonstrations),
-    ):
+    """Runs all checks for a run of `config`; without one, those that need none."""
+    checks = [versions, gl_libraries, jax_devices, convolutions]
+    checks += [rendering, memory, demonstrations] if config else []
+    for check in checks:
         try:
             yield from check(config)
         # A broken package may raise anything, and must not hide the other findings.
@@ -102,8 +101,8 @@ def convolutions(_: Any) -> Iterator[Finding]:
 
     if not devices.device_name().startswith("cpu"):
         return
-    advice = "XLA's are used: an update at the paper's sizes takes 2.6 times as long"
     problem = build.problem()
+    advice = "XLA's are used: an update at the paper's sizes takes 2.6 times as long"
     value = problem or "in C, compiled for this processor"
     yield _judged("convolutions", value, advice if problem else "")
 
@@ -112,16 +111,14 @@ def rendering(config: Any) -> Iterator[Finding]:
     """Renders with the chosen backend at each quality, and times it."""
     from jaxil.environments.camera import RENDER_QUALITIES
 
-    backend = os.environ.get("MUJOCO_GL", "")
-    if backend in ("disable", "disabled", "off", "false", "0"):
-        advice = f"{_GL_INSTALL}; or unset MUJOCO_GL, if you set it"
-        yield Finding("fault", "MUJOCO_GL", f"{backend}: nothing renders", advice)
-        return
-    task, size = ("walker_walk", 84) if not config else (config.task, config.image_size)
+    backend, size = os.environ.get("MUJOCO_GL", ""), config.image_size
     try:
-        times = {each: _render(task, size, each) for each in RENDER_QUALITIES}
+        if backend in ("disable", "disabled", "off", "false", "0"):
+            raise RuntimeError("nothing renders")
+        times = {each: _render(config.task, size, each) for each in RENDER_QUALITIES}
     except (ImportError, RuntimeError) as error:
-        yield Finding("fault", "MUJOCO_GL", f"{backend}: {error}", _GL_INSTALL)
+        advice = f"{_GL_INSTALL}; or unset MUJOCO_GL, if you set it"
+        yield Finding("fault", "MUJOCO_GL", f"{backend}: {error}", advice)
         return
     yield Finding("ok", "MUJOCO_GL", backend)
     name, _ = times["paper"]
@@ -133,9 +130,9 @@ def rendering(config: Any) -> Iterator[Finding]:
         advice += "with NVIDIA_DRIVER_CAPABILITIES=all"
     yield _judged("GL renderer", name, advice)
     for quality, (_, value) in times.items():
-        text, advice = f"{value:.2f} ms for {size}x{size} of {task}", ""
-        used = config is not None and config.render_quality == quality
-        if used and quality == "paper" and value > _SLOW_FRAME_MS:
+        text, advice = f"{value:.2f} ms for {size}x{size} of {config.task}", ""
+        used = config.render_quality == quality == "paper"
+        if used and value > _SLOW_FRAME_MS:
             advice = "--config.render_quality=fast takes "
             advice += f"{times['fast'][1]:.2f} ms and looks slightly different"
         yield _judged(f"frame, {quality}", text, advice)
@@ -147,11 +144,10 @@ def memory(config: Any) -> Iterator[Finding]:
 
     available = host_memory.available_bytes()
     if available is None:
-        value, advice = "cannot be read on this machine", "watch it during the run"
-        yield Finding("warning", "memory", value, advice)
+        yield Finding("warning", "memory", "cannot be read here", "watch it yourself")
         return
     value = f"{available / 1e9:.1f} GB available"
-    if config is None or config.observation != "pixels":  # state vectors are small
+    if config.observation != "pixels":  # state vectors are small
         yield Finding("ok", "memory", value)
         return
     needed = jaxil_config.memory_bytes(config)
@@ -180,26 +176,21 @@ def demonstrations(config: Any) -> Iterator[Finding]:
     from jaxil.demonstrations import states
     from jaxil.training import assembly
 
-    shipped = states.shipped_tasks()
-    if not shipped:
+    tasks = states.shipped_tasks()
+    configs = [jaxil_config.default_config(task=task) for task in tasks]
+    if not tasks:
         advice = "reinstall the package: its demonstrations folder is empty"
         yield Finding("fault", "demonstrations", "none are shipped", advice)
-    configs = [jaxil_config.default_config(task=task) for task in shipped]
-    if config is not None and jaxil_config.uses_demonstrations(config):
+    if jaxil_config.uses_demonstrations(config):
         configs.append(config)
     for each in configs:
         fault = assembly.demonstration_fault(each)
-        source = each.demonstrations.source or f"shipped for {each.task}"
-        level = "fault" if fault else "ok"
-        yield Finding(level, "demonstrations", fault or f"{source}: readable")
+        value = fault or each.demonstrations.source or f"{each.task}, shipped"
+        yield Finding("fault" if fault else "ok", "demonstrations", value)
 
 
 def _render(task: str, image_size: int, quality: str) -> tuple[str, float]:
-    """Returns the GL renderer's name and the time of one image.
-
-    Raises:
-      RuntimeError: nothing renders, or all pixels have one colour.
-    """
+    """Returns the GL renderer's name and the milliseconds of one image."""
     from jaxil.environments import suite
 
     environment = suite.make_environment(

@@ -218,7 +218,7 @@ def test_demonstrations_that_cannot_be_used(monkeypatch, config, tmp_path):
     broken = tmp_path / "walker_walk.npz"
     broken.write_bytes(b"PK")
     monkeypatch.setattr(states, "_shipped_folder", lambda: tmp_path)
-    first = next(doctor.demonstrations(None))
+    first = next(doctor.demonstrations(config))
     assert (first.level, str(broken) in first.value) == ("fault", True)
 
 

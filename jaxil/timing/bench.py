@@ -16,7 +16,6 @@ from jaxil import train
 from jaxil.config import Config
 from jaxil.environments.interaction import FinishedEpisode
 from jaxil.machine.progress import ProgressLine
-from jaxil.replay import replay
 from jaxil.training import assembly
 
 _EPISODE_STEPS = 500  # of tasks without a limit
@@ -174,15 +173,8 @@ class Bench:
         return agent.update_step.lower(*shapes)
 
     def replay_bytes(self) -> int:
-        """Returns the size of the full replay."""
-        frames, actions = self.episode.frames, self.episode.actions
-        return replay.memory_bytes(
-            capacity_steps=self.config.replay_size_steps,
-            episode_steps=len(actions),
-            observation_shape=frames.shape[1:],
-            observation_dtype=frames.dtype,
-            action_dim=actions.shape[1],
-        )
+        """Returns the size of the frames of a full replay."""
+        return self._run.replay.frames.nbytes
 
     def state_bytes(self) -> int:
         """Returns the size of the learner's state, with optimisers and rewarder."""

@@ -35,7 +35,7 @@ ROWS: dict[str, dict[str, str]] = {
         "learner_state_mb": "networks, optimisers, target critic and rewarder",
         "batch_mb": "of one update, the experts' included",
         "update_temp_mb": "temporaries of the update",
-        "replay_gb": "when full",
+        "replay_gb": "its frames when full",
         "peak_memory_gb": "of this process",
         "peak_device_memory_gb": "of the accelerator",
     },
@@ -93,21 +93,15 @@ def read(path: str) -> dict[str, Any]:
     Raises:
       UsageError: it holds none.
     """
-    hint = "give a file that `python -m jaxil.benchmark --json=FILE` wrote"
     try:
         results = json.loads(pathlib.Path(path).read_text())
-    except OSError as error:
-        reason = f"cannot be read ({error.strerror}): {hint}"
-        raise UsageError(f"--compare={path} {reason}") from error
-    except ValueError as error:
-        raise UsageError(f"--compare={path} is not JSON ({error}): {hint}") from error
-    if isinstance(results, list):
-        raise UsageError(f"--compare={path} is a sweep: {hint}, without --sweep")
-    fields = results if isinstance(results, dict) else {}
-    missing = [n for n, kind in _ALWAYS.items() if not isinstance(fields.get(n), kind)]
-    if missing:
-        reason = f"holds no results (no {', '.join(missing)}): {hint}"
-        raise UsageError(f"--compare={path} {reason}")
+        if not all(isinstance(results[name], kind) for name, kind in _ALWAYS.items()):
+            raise ValueError("its values are of other types")
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise UsageError(
+            f"--compare={path} is not a file that `python -m jaxil.benchmark "
+            f"--json=FILE` wrote without --sweep ({error}); name one that is"
+        ) from error
     return results
 
 
@@ -125,20 +119,16 @@ def comparison_table(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """Names what else differs: device, machine, fields of the config."""
     before, now = (
-        {name: repr(each.get(name)) for name in _CIRCUMSTANCES if name in old}
-        | {
-            name: repr(value)
-            for name, value in flatten_dict(
-                {"config": json.loads(json.dumps(each["config"]))}, sep="."
-            ).items()
-        }
+        {name: each.get(name) for name in _CIRCUMSTANCES if name in old}
+        | flatten_dict({"config": json.loads(json.dumps(each["config"]))}, sep=".")
         for each in (old, new)
     )
-    return [
-        f"{name}: {before.get(name, 'absent')} then, {now.get(name, 'absent')} now"
-        for name in dict.fromkeys([*before, *now])
-        if before.get(name) != now.get(name)
-    ]
+    found = []
+    for name in dict.fromkeys([*before, *now]):
+        then, here = (repr(e[name]) if name in e else "absent" for e in (before, now))
+        if then != here:
+            found.append(f"{name}: {then} then, {here} now")
+    return found
 
 
 def _cells(*numbers: float | None) -> str:
