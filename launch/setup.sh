@@ -2,16 +2,16 @@
 # Set-up on Linux, for quickstart.sh and test.sh, which source this file.
 #
 # set_up installs the project into .venv at its root, in editable mode, with the
-# versions of constraints.txt; as root also OpenGL and GCC. A .venv that is ready is
-# reused, one that was cut off is rebuilt, and two set-ups at once take turns.
-# PYTHON=/path/to/python chooses the interpreter of a new .venv.
+# versions of constraints.txt; as root also OpenGL and GCC. A ready .venv is reused, one
+# that was cut off is rebuilt, and two set-ups at once take turns. PYTHON=PATH chooses
+# the interpreter of a new .venv.
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)
 venv=$root/.venv
 pythons=(python3.11 python3.12 python3) # labmaze, of dm-control, has no later wheels
 gl_packages=(libegl1 libgl1-mesa-dri libosmesa6)
 ready_file=$venv/jaxil-ready # lines "DIGEST EXTRAS"; absent while .venv is changed
-system_file=$venv/jaxil-system # there when GL was found or installed
+system_file=$venv/jaxil-system # there once GL was found or installed
 log_file=$root/.jaxil-setup.log
 
 say() { printf '%s\n' "$*" >&2; }
@@ -58,9 +58,8 @@ install_project() { # EXTRAS
   mv "$ready_file.new" "$ready_file"
 }
 
-is_ready() { # EXTRAS
+is_ready() { # EXTRAS; each includes the project's own dependencies
   local stamp
-  # Each extra includes the project's own dependencies.
   stamp=$(digest) && grep -qs "^$stamp ${1:+$1\$}" "$ready_file"
 }
 
@@ -74,10 +73,9 @@ digest() {
 
 # Sets python. Installs Debian's venv package where only that is missing.
 find_python() {
-  local candidate version
+  local candidate version print_version='import sys; print("%d.%d" % sys.version_info[:2])'
   for candidate in "${PYTHON:-${pythons[@]}}"; do
-    version=$("$candidate" -c 'import sys; print("%d.%d" % sys.version_info[:2])' \
-      2>/dev/null) || continue
+    version=$("$candidate" 2>/dev/null -c "$print_version") || continue
     [[ $version == 3.1[12] ]] || continue
     "$candidate" -c 'import ensurepip, venv' 2>/dev/null ||
       (apt_install "python$version-venv") || continue
@@ -107,8 +105,7 @@ apt_install() { # PACKAGES...
       "command again."
   say "Installing $* with apt-get (about a minute)."
   # Repairs what an earlier cut-off left; a source that is out of reach may not matter.
-  "${sudo[@]}" dpkg --configure -a >"$log_file" 2>&1 || true
-  "${sudo[@]}" apt-get update >>"$log_file" 2>&1 || true
+  "${sudo[@]}" bash -c 'dpkg --configure -a; apt-get update' >"$log_file" 2>&1 || true
   for package in "$@"; do # newer distributions lack libosmesa6, Ubuntu lacks chromium
     if apt-cache show "$package" >/dev/null 2>&1; then packages+=("$package"); fi
   done

@@ -118,16 +118,16 @@ def test_a_sweep_measures_each_value(monkeypatch, tmp_path, capsys):
 
     monkeypatch.setattr(measurement, "measure", measure)
     path = tmp_path / "sweep.json"
-    flags = ["--full", "--repeats=1", "--sweep=batch_size:4,8", f"--json={path}"]
-    benchmark.main(["benchmark", _CONFIG, "--config.seed=3", *flags])
+    flags = ["--full", "--repeats=1", "--sweep=batch_size:8,16", f"--json={path}"]
+    benchmark.main(["benchmark", _CONFIG, *SMALL, "--config.seed=3", *flags])
     settings = {"repeats": 1, "steps": 40, "full": True}
-    assert seen == [(4, 3, settings), (8, 3, settings)]
+    assert seen == [(8, 3, settings), (16, 3, settings)]
     assert [each["sweep"] for each in json.loads(path.read_text())] == [
-        {"field": "batch_size", "value": 4},
         {"field": "batch_size", "value": 8},
+        {"field": "batch_size", "value": 16},
     ]
     rows = capsys.readouterr().out.splitlines()[-2:]
-    assert [row.split()[0] for row in rows] == ["4", "8"]
+    assert [row.split()[0] for row in rows] == ["8", "16"]
 
 
 def test_a_full_replay_is_full(tmp_path):
