@@ -13,6 +13,7 @@ import pytest
 
 from jaxil import config as jaxil_config
 from jaxil import doctor
+from jaxil.machine import cache
 from jaxil.native import build
 from jaxil.training import assembly
 
@@ -55,6 +56,15 @@ def compiler_that(tmp_path, script):
     return str(path)
 
 
+@pytest.fixture
+def quick_compiler(tmp_path_factory, monkeypatch):
+    """One that copies this machine's cached library, since compiling is slow."""
+    library = build.build(cache.compilation_folder())
+    script = f'for last; do :; done; cp {library} "$last"'
+    monkeypatch.setenv("CC", compiler_that(tmp_path_factory.mktemp("cc"), script))
+
+
+@pytest.mark.usefixtures("quick_compiler")
 def test_is_compiled_once_and_leaves_nothing_else(tmp_path):
     folder = tmp_path / "not" / "yet"
     path = build.build(folder)
@@ -66,12 +76,14 @@ def test_is_compiled_once_and_leaves_nothing_else(tmp_path):
 
 _LOAD = """
 import ctypes, pathlib, sys
+from jaxil.machine import cache
 from jaxil.native import build
 path = build.build(pathlib.Path(sys.argv[1]))
 build.register(ctypes.CDLL(str(path)))
 """
 
 
+@pytest.mark.usefixtures("quick_compiler")
 @pytest.mark.parametrize("damage", ["empty", "truncated", "flipped"])
 def test_a_damaged_library_is_rebuilt(tmp_path, damage):
     path = build.build(tmp_path)
@@ -85,6 +97,7 @@ def test_a_damaged_library_is_rebuilt(tmp_path, damage):
     assert os.listdir(tmp_path) == [path.name]
 
 
+@pytest.mark.usefixtures("quick_compiler")
 def test_another_processor_is_another_library(tmp_path, monkeypatch):
     path = build.build(tmp_path)
     monkeypatch.setattr(build.devices, "instruction_set", lambda: "flags : avx2 fma")
@@ -103,6 +116,7 @@ def test_a_wheel_has_all_sources():
     assert sources <= packed
 
 
+@pytest.mark.usefixtures("quick_compiler")
 def test_other_flags_are_another_library(tmp_path):
     assert build.build(tmp_path) != build.build(tmp_path, (*build.FLAGS, "-g"))
     assert len(os.listdir(tmp_path)) == 2
