@@ -1,13 +1,13 @@
-r"""Times and weighs every part of a run on this machine, and the loop that joins them.
+r"""Measures time and memory of each part of a run on this machine, and of its loop.
 
     python -m jaxil.benchmark --config=configs/pdac_walker.py --json=benchmark.json
     python -m jaxil.benchmark --config=configs/pdac_walker.py --compare=benchmark.json
     python -m jaxil.benchmark --config=configs/pdac_walker.py \
         --sweep=batch_size:64,128,256 --json=batch_sizes.json
 
-Medians over repeats, after a warm-up; nothing is learned and nothing kept. Compiling
-without a cache, and starting a run, in a process of its own, are timed last; --nostart
-leaves both out, as a sweep does. --full weighs memory with a full replay.
+Times are medians over repeats, after a warm-up. Nothing is kept. Compiling without a
+cache, and starting a run in a separate process, are timed last; --nostart skips both,
+and so does a sweep.
 """
 
 import json
@@ -19,126 +19,132 @@ from typing import Any
 from absl import flags
 
 from jaxil import command
-from jaxil.errors import UsageError
+from jaxil.errors import UsageError, unknown_name
+
+_EXAMPLE = "such as --sweep=batch_size:64,128,256"
 
 
 def main(argv: list[str]) -> None:
     """Runs the command."""
     values = command.parse(argv, __doc__ or "", _define)
-    environment = dict(os.environ)  # as a new process would find it
+    environment = dict(os.environ)  # as a new process would get it
     from jaxil.machine import startup
 
     print(startup.prepare(), file=sys.stderr, flush=True)
-    from jaxil.timing import comparison, measurement, sweeping, tables
+    from jaxil.timing import measurement, tables
     from jaxil.training import assembly
 
     faults = assembly.problems(values.config) + _flag_problems(values)
     if faults:
         raise UsageError(faults)
-    repeats, steps = values.repeats, values.steps
+    settings: Any = {name: values[name].value for name in ("repeats", "steps", "full")}
     if values.sweep is not None:
-        sweep = sweeping.parse(values.sweep, values.config)
-        found = []
-        for value, config in sweep.configs.items():
-            print(f"{sweep.field}={value}", file=sys.stderr, flush=True)
-            results = measurement.measure(
-                config, repeats=repeats, steps=steps, full=values.full
-            )
-            found.append({"sweep": {"field": sweep.field, "value": value}, **results})
-        print(tables.machine_line(found[0]))
-        print(tables.sweep_table(sweep.field, found))
-        _write(values.json, found)
-        return
-    old = None if values.compare is None else comparison.read(values.compare)
-    results = measurement.measure(
-        values.config,
-        repeats=repeats,
-        steps=steps,
-        environment=environment if values.start else None,
-        full=values.full,
-    )
-    print(tables.results_table(results))
-    if old is not None:
-        print(f"\nagainst {values.compare}")
-        print(tables.comparison_table(comparison.pairs(old, results)))
-        for line in comparison.differences(old, results):
-            print(f"warning: not the same: {line}", file=sys.stderr)
-    _write(values.json, results)
+        results: Any = []
+        field, configs = _swept(values.sweep, values.config)
+        for value, config in configs.items():
+            print(f"{field}={value}", file=sys.stderr, flush=True)
+            found = measurement.measure(config, **settings)
+            results.append({"sweep": {"field": field, "value": value}, **found})
+        print(tables.machine_line(results[0]))
+        print(tables.sweep_table(results))
+    else:
+        old = None if values.compare is None else tables.read(values.compare)
+        if values.start:
+            settings["environment"] = environment
+        results = measurement.measure(values.config, **settings)
+        print(tables.results_table(results))
+        if old is not None:
+            print(f"\nagainst {values.compare}")
+            print(tables.comparison_table(old, results))
+            for line in tables.differences(old, results):
+                print(f"warning: not the same: {line}", file=sys.stderr)
+    if values.json is not None:
+        from jaxil.files.metrics import write_atomically
+
+        try:
+            text = json.dumps(results, indent=2) + "\n"
+            write_atomically(values.json, text.encode())
+        except OSError as error:
+            raise UsageError(_unwritable(values.json)) from error
+
+
+def _swept(text: str, config: Any) -> tuple[str, dict[int | float, Any]]:
+    """Reads FIELD:VALUE,VALUE,...; returns the field, and configs by value.
+
+    Raises:
+      UsageError: names all faults, those of the swept configs too.
+    """
+    from flax.traverse_util import flatten_dict
+
+    from jaxil.training import assembly
+
+    field, _, words = text.partition(":")
+    fields: Any = flatten_dict(config.to_dict(), sep=".")
+    kinds = {n: type(v) for n, v in fields.items() if type(v) in (int, float)}
+    if field not in kinds:
+        fault = unknown_name("--sweep", field, tuple(kinds))
+        raise UsageError(f"{fault} (a field that is a number, {_EXAMPLE})")
+    kind = "a whole number" if kinds[field] is int else "a number"
+    faults, configs = [], {}
+    for word in words.split(","):
+        try:
+            value = kinds[field](word)
+        except ValueError:
+            faults.append(f"--sweep={text!r}: {word!r} is not {kind}; write {_EXAMPLE}")
+            continue
+        configs[value] = config.copy_and_resolve_references()
+        configs[value].update_from_flattened_dict({field: value})
+        faults += assembly.problems(configs[value])
+    if faults:
+        raise UsageError(dict.fromkeys(faults))
+    return field, configs
 
 
 def _flag_problems(values: flags.FlagValues) -> list[str]:
-    """Returns one sentence for each flag that would fail only after minutes."""
+    """Returns a sentence for each flag that would otherwise fail only after minutes."""
     faults = []
     if values.sweep is not None and values.compare is not None:
-        faults.append("--sweep and --compare don't go together; leave one out")
+        faults.append("--sweep and --compare cannot be combined; leave one out")
     if values.json is not None:
         path = pathlib.Path(values.json)
         if path.is_dir() or not os.access(path.parent, os.W_OK | os.X_OK):
-            faults.append(
-                f"--json={values.json} can't be written; name a file in a folder of "
-                "yours"
-            )
+            faults.append(_unwritable(values.json))
     return faults
 
 
-def _write(path: str | None, results: Any) -> None:
-    if path is None:
-        return
-    from jaxil.files.metrics import write_atomically
-
-    try:
-        write_atomically(path, (json.dumps(results, indent=2) + "\n").encode())
-    except OSError as error:
-        raise UsageError(
-            f"--json={path} can't be written ({error.strerror}); name a file in a "
-            "folder of yours"
-        ) from error
+def _unwritable(path: str) -> str:
+    return f"--json={path} cannot be written; name a file in a folder of yours"
 
 
 def _define(values: flags.FlagValues) -> None:
     command.define_config(values)
-    flags.DEFINE_string("json", None, "file for the results", flag_values=values)
-    flags.DEFINE_string(
-        "compare",
-        None,
-        "file of an earlier --json: prints old, new and their ratio",
-        flag_values=values,
-    )
-    flags.DEFINE_string(
-        "sweep",
-        None,
-        "FIELD:VALUE,VALUE,...: a config field to vary, such as batch_size:64,128; "
-        "--json then gets a list",
-        flag_values=values,
-    )
-    flags.DEFINE_boolean(
-        "start",
-        True,
-        "time compiling without a cache and starting a run too",
-        flag_values=values,
-    )
-    flags.DEFINE_boolean(
-        "full",
-        False,
-        "fill the replay before memory is weighed, as in a run that is long under way",
-        flag_values=values,
-    )
-    flags.DEFINE_integer(
-        "repeats",
-        10,
-        "timings of each part",
-        lower_bound=1,
-        upper_bound=10_000,
-        flag_values=values,
-    )
-    flags.DEFINE_integer(
-        "steps",
-        40,
-        "decisions to time of the loop, with and without overlap",
-        lower_bound=2,
-        upper_bound=1_000_000,
-        flag_values=values,
-    )
+    for name, meaning in (
+        ("json", "file for the results"),
+        ("compare", "file of an earlier --json: prints old, new and their ratio"),
+        (
+            "sweep",
+            "FIELD:VALUE,VALUE,...: a config field to vary, such as "
+            "batch_size:64,128; --json then writes a list",
+        ),
+    ):
+        flags.DEFINE_string(name, None, meaning, flag_values=values)
+    for name, default, meaning in (
+        ("start", True, "also time compiling without a cache and starting a run"),
+        ("full", False, "fill the replay before memory is measured"),
+    ):
+        flags.DEFINE_boolean(name, default, meaning, flag_values=values)
+    for name, default, lowest, meaning in (
+        ("repeats", 10, 1, "timings of each part; ten times as many of the short ones"),
+        ("steps", 40, 2, "agent steps to time of the loop, with and without overlap"),
+    ):
+        flags.DEFINE_integer(
+            name,
+            default,
+            meaning,
+            lower_bound=lowest,
+            upper_bound=1_000_000,
+            flag_values=values,
+        )
 
 
 if __name__ == "__main__":

@@ -220,9 +220,9 @@ def _named_output(argv: list[str]) -> list[str]:
 
 def _max_bytes() -> int:
     """Returns how much memory one array of a file may take."""
-    from jaxil.training import assembly
+    from jaxil.machine import memory
 
-    return assembly.spare_bytes()
+    return memory.spare_bytes()
 
 
 def _define(values: flags.FlagValues) -> None:

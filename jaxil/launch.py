@@ -28,7 +28,7 @@ def main(argv: list[str]) -> int:
 
     print(startup.prepare(), file=sys.stderr, flush=True)
 
-    from jaxil import train
+    from jaxil import doctor, train
     from jaxil.environments.pool import EnvironmentsFailed
     from jaxil.machine import provenance
     from jaxil.training import agent as agents
@@ -39,7 +39,8 @@ def main(argv: list[str]) -> int:
     faults = assembly.problems(config) + workdir.problems(folder, config)
     if faults:
         raise UsageError(faults)
-    print(provenance.memory_sentence(config), file=sys.stderr, flush=True)
+    for finding in doctor.memory(config):
+        print(finding, file=sys.stderr, flush=True)
     with workdir.opened(folder):
         try:
             gl_name = assembly.renderer_name(config)

@@ -2,11 +2,9 @@
 
 import contextlib
 import dataclasses
-import functools
 import pathlib
 import sys
 import time
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -14,23 +12,11 @@ import numpy as np
 
 from jaxil import methods
 from jaxil.config import Config
-from jaxil.demonstrations.loading import Demonstrations
-from jaxil.environments.player import Player
 from jaxil.environments.pool import EnvironmentsFailed
-from jaxil.learner.state import TrainState
-from jaxil.machine.progress import ProgressLine
 from jaxil.machine.signals import StopOnSignals
-from jaxil.maths.types import Episode, ExpertEpisodes
-from jaxil.replay.replay import Replay
-from jaxil.training import agent as agents
+from jaxil.maths.types import Episode
 from jaxil.training import assembly
-from jaxil.training.agent import Agent
-from jaxil.training.checkpoint import Checkpoints
-from jaxil.training.evaluator import Evaluator
-from jaxil.training.expert_distance import Closeness
-from jaxil.training.run_log import Outputs
-from jaxil.training.stopwatch import Stopwatch, TimedPool
-from jaxil.training.updates import Updates
+from jaxil.training.parts import Parts, make_parts
 
 # Names of NumPy's random streams: every draw is keyed by (seed, stream, step), so
 # that a resumed run repeats those of an unbroken one without any stored state.
@@ -42,66 +28,8 @@ class TrainingDiverged(RuntimeError):
     """A loss or reward is no longer a finite number."""
 
 
-@dataclasses.dataclass
-class Counters:
-    """How far a run has come; saved with each checkpoint.
-
-    Attributes:
-      num_steps: agent steps so far.
-      num_episodes: whole episodes so far.
-      num_evals: evaluations so far.
-      last_eval_step: agent step of the last evaluation.
-      last_checkpoint_step: agent step of the last checkpoint.
-      last_refresh_step: agent step of the last recomputation of stored rewards.
-      owes_evaluation: whether an evaluation was due when the run was stopped.
-      seconds: wall-clock of the run, earlier processes included.
-    """
-
-    num_steps: int = 0
-    num_episodes: int = 0
-    num_evals: int = 0
-    last_eval_step: int = 0
-    last_checkpoint_step: int = 0
-    last_refresh_step: int = 0
-    owes_evaluation: bool = False
-    seconds: float = 0.0
-
-
-@dataclasses.dataclass
-class Run:
-    """One training run: its parts, its state, and what happens to them in order.
-
-    Attributes:
-      config: checked.
-      agent: the compiled functions.
-      state: the learner's.
-      counters: how far it has come.
-      player: plays episodes; None for a method that does not.
-      episode_steps: agent steps of a usual episode.
-      replay: where finished episodes go.
-      updates: samples batches and runs the learner's step.
-      experts: demonstrations on the device, for methods that match whole episodes.
-      evaluator: plays evaluations.
-      checkpoints: of this run.
-      log: tables, curve and videos.
-      progress: the line on the terminal.
-      stopwatch: where the time goes.
-    """
-
-    config: Config
-    agent: Agent
-    state: TrainState
-    counters: Counters
-    player: Player | None
-    episode_steps: int
-    replay: Replay
-    updates: Updates
-    experts: ExpertEpisodes | None
-    evaluator: Evaluator
-    checkpoints: Checkpoints
-    log: Outputs
-    progress: ProgressLine
-    stopwatch: Stopwatch
+class Run(Parts):
+    """One training run: its parts, its state, and what happens to them in order."""
 
     def __post_init__(self) -> None:
         self.stop_asked = False
@@ -395,63 +323,6 @@ class Run:
         return np.random.default_rng([self.config.seed, stream, num_steps])
 
 
-def make_run(
-    config: Config,
-    workdir: pathlib.Path,
-    demonstrations: Demonstrations | None,
-    say: Callable[[str], None],
-) -> Run:
-    """Makes the parts of a run, which resumes from the newest checkpoint if any."""
-    environment = assembly.training_environment(config)
-    agent = agents.make_agent(config, environment, demonstrations)
-    replay = assembly.make_replay(config, environment)
-    checkpoints = Checkpoints(workdir, say=say)
-    counters, open_episodes = Counters(), {}
-    resumed = checkpoints.newest() is not None
-    if resumed:
-        state, saved = checkpoints.restore(agents.abstract_state(agent), replay)
-        open_episodes = {
-            int(number): np.asarray(actions, np.float32)
-            for number, actions in saved.pop("open_episodes", {}).items()
-        }
-        counters = Counters(**saved)
-    else:
-        state = agent.init_state()
-    frame = counters.num_steps * config.action_repeat
-    if resumed:
-        say(f"resuming from the checkpoint of frame {frame}")
-    stopwatch = Stopwatch()
-    experts = agents.expert_episodes(agent.rewarder, demonstrations)
-    distance = None
-    if demonstrations is not None:
-        distance = Closeness(config, workdir, demonstrations)
-    return Run(
-        config=config,
-        agent=agent,
-        state=state,
-        counters=counters,
-        player=assembly.make_player(
-            config,
-            environment,
-            first_episode=counters.num_episodes + len(open_episodes),
-            open_episodes=open_episodes,
-            timed=functools.partial(TimedPool, stopwatch=stopwatch),
-            say=say,
-        ),
-        episode_steps=environment.episode_steps or 0,
-        replay=replay,
-        updates=Updates(config, agent, replay, demonstrations, experts),
-        experts=experts,
-        evaluator=Evaluator(
-            config, agent, assembly.evaluation_environment(config), experts, distance
-        ),
-        checkpoints=checkpoints,
-        log=Outputs(workdir, config, demonstrations, frame if resumed else None),
-        progress=ProgressLine(config.total_frames, first_frame=frame),
-        stopwatch=stopwatch,
-    )
-
-
 def train(config: Config, workdir: pathlib.Path) -> bool:
     """Trains a run to its end, from its newest checkpoint if there is one.
 
@@ -474,7 +345,7 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
     demonstrations = assembly.load_demonstrations(config)
     method = methods.get(config.method)
     say(f"{config.task}: {method.label}, {method.about}; seed {config.seed}")
-    run = make_run(config, workdir, demonstrations, say)
+    run = Run(**make_parts(config, workdir, demonstrations, say))
     with contextlib.closing(run), StopOnSignals(run.ask_to_stop):
         try:
             run.loop()

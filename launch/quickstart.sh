@@ -2,20 +2,20 @@
 # Sets up jaxil on this machine, then trains an agent.
 #
 #   bash launch/quickstart.sh
-#       imitates ten episodes of cartpole_swingup from their pixels, with small
-#       networks that learn on two CPU cores, into runs/quickstart
+#       imitates ten episodes of cartpole_swingup from pixels, with small networks that
+#       learn on two CPU cores, into runs/quickstart
 #   bash launch/quickstart.sh --config=configs/psil.py:walker_walk --workdir=runs/x
 #       runs `python -m jaxil.launch` with these flags
 #
-# The same command again goes on where it stopped. Relative paths are seen from the
-# project's root. The set-up (minutes, once) is told in launch/setup.sh.
+# Rerun the same command to resume. Relative paths start at the project's root. The
+# set-up takes minutes, once: see launch/setup.sh.
 
 set -euo pipefail
 
 # shellcheck source-path=SCRIPTDIR source=setup.sh
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
 
-# As in jaxil/platform.py: a device that is hidden from CUDA or jax doesn't count.
+# As in jaxil/machine/devices.py: a device hidden from CUDA or jax does not count.
 has_nvidia_device() {
   case ${JAX_PLATFORMS:-} in cpu*) return 1 ;; esac
   case ${CUDA_VISIBLE_DEVICES-all} in "" | -1) return 1 ;; esac
@@ -23,10 +23,7 @@ has_nvidia_device() {
 }
 
 extras=
-if has_nvidia_device; then
-  extras=gpu
-fi
-
+if has_nvidia_device; then extras=gpu; fi
 case " $* " in
   *" --help "* | *" -h "*)
     sed -n '2,/^$/s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"
@@ -34,12 +31,10 @@ case " $* " in
     is_ready "$extras" || exit 0 # a question should not start an installation
     ;;
 esac
-
 set_up "$extras"
-
 if (($# == 0)); then
   set -- --config=configs/tiny.py:pdac,cartpole_swingup --workdir=runs/quickstart
   say "Training into $root/runs/quickstart: watch learning_curve.png, videos/ and" \
-    "eval.csv there. Ctrl-C stops and saves; the same command goes on."
+    "eval.csv there. Ctrl-C saves and stops; rerun the same command to resume."
 fi
 exec "$venv/bin/python" -m jaxil.launch "$@"

@@ -3,19 +3,20 @@
 import importlib.metadata
 import os
 
+import numpy as np
 import pytest
 
 from jaxil import config as jaxil_config
 from jaxil import doctor
 from jaxil.command import UsageError
 from jaxil.demonstrations import states
-from jaxil.environments import suite
-from jaxil.machine import provenance, startup
+from jaxil.environments import pixel_environment, suite
+from jaxil.machine import devices, memory
 
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch):
-    monkeypatch.setattr(doctor, "_MEASURE_SECONDS", 0.01)
+    monkeypatch.setattr(doctor, "_NUM_FRAMES", 1)
 
 
 @pytest.fixture(name="config")
@@ -73,10 +74,15 @@ def test_versions_known_to_clash(monkeypatch, package, version, level):
         "version",
         lambda name: version if name == package else real(name),
     )
-    finding = one(doctor.versions(), package)
-    assert finding.level == level
-    assert finding.value == version
-    assert (f"pip install '{package}>=" in finding.advice) == (level == "fault")
+    findings = list(doctor.versions(None))
+    faults = [finding for finding in findings if finding.level == "fault"]
+    if level == "ok":
+        assert faults == []
+        assert f"{package} {version}" in one(findings, "packages").value
+    else:
+        (fault,) = faults
+        assert (fault.what, fault.value) == (package, version)
+        assert f"pip install '{package}<" in fault.advice
 
 
 def test_a_missing_package_is_a_fault(monkeypatch):
@@ -84,12 +90,13 @@ def test_a_missing_package_is_a_fault(monkeypatch):
         raise importlib.metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(importlib.metadata, "version", missing)
-    assert {finding.level for finding in doctor.versions()} == {"fault"}
+    finding = one(doctor.versions(None), "mujoco")
+    assert (finding.level, finding.value) == ("fault", "missing")
 
 
 def test_missing_gl_libraries(monkeypatch):
     monkeypatch.setattr(doctor.ctypes.util, "find_library", lambda name: None)
-    finding = one(doctor.gl_libraries(), "GL libraries")
+    finding = one(doctor.gl_libraries(None), "GL libraries")
     assert finding.level == "fault"
     assert "libegl1" in finding.advice
     monkeypatch.setattr(
@@ -97,7 +104,7 @@ def test_missing_gl_libraries(monkeypatch):
         "find_library",
         lambda name: "libOSMesa.so.8" if name == "OSMesa" else None,
     )
-    assert one(doctor.gl_libraries(), "GL libraries").level == "ok"
+    assert one(doctor.gl_libraries(None), "GL libraries").level == "ok"
 
 
 def test_nothing_renders(monkeypatch, config):
@@ -126,8 +133,8 @@ def test_nothing_renders(monkeypatch, config):
 def test_software_beside_a_device_is_warned_of(
     monkeypatch, config, renderer, has_cuda, level
 ):
-    monkeypatch.setattr(doctor, "_frame_milliseconds", lambda *_: (renderer, 1.0))
-    monkeypatch.setattr(startup, "has_cuda_device", lambda: has_cuda)
+    monkeypatch.setattr(doctor, "_render", lambda *_: (renderer, 1.0))
+    monkeypatch.setattr(devices, "has_cuda_device", lambda: has_cuda)
     finding = one(doctor.rendering(config), "GL renderer")
     assert finding.level == level
     assert renderer in finding.value
@@ -135,9 +142,7 @@ def test_software_beside_a_device_is_warned_of(
 
 def test_slow_frames_are_warned_of_where_they_are_used(monkeypatch, config):
     times = {"paper": 25.0, "fast": 1.5, "smooth": 2.5}
-    monkeypatch.setattr(
-        doctor, "_frame_milliseconds", lambda task, size, q: ("GPU", times[q])
-    )
+    monkeypatch.setattr(doctor, "_render", lambda task, size, q: ("GPU", times[q]))
     finding = one(doctor.rendering(config), "frame, paper")
     assert finding.level == "warning"
     assert "--config.render_quality=fast takes 1.50 ms" in finding.advice
@@ -146,8 +151,8 @@ def test_slow_frames_are_warned_of_where_they_are_used(monkeypatch, config):
 
 
 def test_jax_on_the_cpu_beside_a_device_is_warned_of(monkeypatch):
-    monkeypatch.setattr(startup, "has_cuda_device", lambda: True)
-    finding = one(doctor.devices(), "jax devices")
+    monkeypatch.setattr(devices, "has_cuda_device", lambda: True)
+    finding = one(doctor.jax_devices(None), "jax devices")
     assert finding.level == "warning"
     assert "jax[cuda12]" in finding.advice
 
@@ -157,16 +162,16 @@ def test_memory_is_compared_with_the_replay(monkeypatch, config):
     levels = {}
     for available in (0.5 * needed, needed + 1e9, needed + 4e9):
         monkeypatch.setattr(
-            startup, "available_memory_bytes", lambda bytes=available: int(bytes)
+            memory, "available_bytes", lambda bytes=available: int(bytes)
         )
         levels[available] = one(doctor.memory(config), "memory").level
     assert list(levels.values()) == ["fault", "warning", "ok"]
-    monkeypatch.setattr(startup, "available_memory_bytes", lambda: None)
+    monkeypatch.setattr(memory, "available_bytes", lambda: None)
     assert one(doctor.memory(config), "memory").level == "warning"
 
 
 def test_states_take_little_memory(monkeypatch, config):
-    monkeypatch.setattr(startup, "available_memory_bytes", lambda: int(1e9))
+    monkeypatch.setattr(memory, "available_bytes", lambda: int(1e9))
     config.observation = "state"
     assert one(doctor.memory(config), "memory").level == "ok"
 
@@ -177,26 +182,26 @@ def test_a_copy_on_the_device_is_counted_where_it_lies(monkeypatch, config):
     frames = jaxil_config.device_memory_bytes(config)
     # 150000 steps in 300 episodes of 500: one frame more in each.
     assert frames == 150_300 * 48 * 48 * 3
-    monkeypatch.setattr(startup, "available_memory_bytes", lambda: int(plain + 2e9))
-    monkeypatch.setattr(provenance, "device_name", lambda: "cpu: cpu")
-    monkeypatch.setattr(provenance, "free_device_bytes", lambda: None)
+    monkeypatch.setattr(memory, "available_bytes", lambda: int(plain + 2e9))
+    monkeypatch.setattr(devices, "device_name", lambda: "cpu: cpu")
+    monkeypatch.setattr(devices, "free_bytes", lambda: None)
     assert one(doctor.memory(config), "memory").level == "warning"  # there twice
-    assert "another 1.04 GB" in provenance.memory_sentence(config)
-    monkeypatch.setattr(provenance, "device_name", lambda: "gpu: NVIDIA H100")
+    assert (
+        f"needs {(plain + frames) / 1e9:.2f}"
+        in one(doctor.memory(config), "memory").value
+    )
+    monkeypatch.setattr(devices, "device_name", lambda: "gpu: NVIDIA H100")
     for free, level in ((1e9, "fault"), (10e9, "ok")):
-        monkeypatch.setattr(
-            provenance, "free_device_bytes", lambda free=free: int(free)
-        )
+        monkeypatch.setattr(devices, "free_bytes", lambda free=free: int(free))
         found = list(doctor.memory(config))
         assert one(found, "memory").level == "ok"
         assert one(found, "device memory").level == level
         assert "NVIDIA H100" in one(found, "device memory").value
-    assert "gpu: NVIDIA H100" in provenance.memory_sentence(config)
 
 
 def test_the_advised_replay_fits(monkeypatch, config):
     config.replay_size_steps = 10_000_000
-    monkeypatch.setattr(startup, "available_memory_bytes", lambda: int(4e9))
+    monkeypatch.setattr(memory, "available_bytes", lambda: int(4e9))
     advice = one(doctor.memory(config), "memory").advice
     field, _, rest = advice.removeprefix("--config.").partition("=")
     config[field] = int(rest.split(",")[0])
@@ -213,8 +218,16 @@ def test_demonstrations_that_cannot_be_used(monkeypatch, config, tmp_path):
     broken = tmp_path / "walker_walk.npz"
     broken.write_bytes(b"PK")
     monkeypatch.setattr(states, "_shipped_folder", lambda: tmp_path)
-    first = next(doctor.demonstrations(None))
+    first = next(doctor.demonstrations(config))
     assert (first.level, str(broken) in first.value) == ("fault", True)
+
+
+def test_blank_images_are_a_fault(monkeypatch, config):
+    blank = np.zeros((48, 48, 3), np.uint8)
+    monkeypatch.setattr(pixel_environment.PixelEnvironment, "frame", lambda _: blank)
+    finding = one(doctor.rendering(config), "MUJOCO_GL")
+    assert finding.level == "fault"
+    assert "MUJOCO_GL=osmesa" in finding.value
 
 
 def test_an_examination_that_breaks_does_not_hide_the_others(monkeypatch, config):

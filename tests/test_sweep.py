@@ -193,14 +193,14 @@ def test_wrong_use_of_the_command_ends_with_status_2(tmp_path):
 
 def test_cores_and_gpus_are_shared_out(monkeypatch):
     monkeypatch.setattr(clusters.os, "sched_getaffinity", lambda _: set(range(3, 11)))
-    monkeypatch.setattr(clusters.startup, "uses_cpu", lambda: True)
+    monkeypatch.setattr(clusters.devices, "uses_cpu", lambda: True)
     two = clusters.places(Cluster("local", num_workers=2), 10)
     assert [place.cores for place in two] == [(3, 4, 5, 6), (7, 8, 9, 10)]
     assert len(clusters.places(Cluster("local"), 100)) == 8
     assert len(clusters.places(Cluster("local"), 3)) == 3
     assert clusters.places(Cluster("local"), 0) == []
-    monkeypatch.setattr(clusters.startup, "uses_cpu", lambda: False)
-    monkeypatch.setattr(clusters.startup, "has_cuda_device", lambda: True)
+    monkeypatch.setattr(clusters.devices, "uses_cpu", lambda: False)
+    monkeypatch.setattr(clusters.devices, "has_cuda_device", lambda: True)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,6")
     one_each = clusters.places(Cluster("local"), 10)
     assert [dict(place.environment) for place in one_each] == [

@@ -1,16 +1,22 @@
-"""Where this machine keeps what can be made again."""
+"""Where this machine keeps what can be computed again."""
 
+import hashlib
 import os
 import pathlib
 
+from jaxil.machine import devices
+
 
 def cache_folder() -> pathlib.Path:
-    """Returns the folder of what can be computed again; it need not exist.
-
-    $JAXIL_CACHE, else `jaxil` in the user's cache folder.
-    """
+    """Returns $JAXIL_CACHE, else `jaxil` in the user's cache folder."""
     own = os.environ.get("JAXIL_CACHE")
     if own:
         return pathlib.Path(own).expanduser()
     shared = os.environ.get("XDG_CACHE_HOME")
     return pathlib.Path(shared or "~/.cache").expanduser() / "jaxil"
+
+
+def compilation_folder() -> pathlib.Path:
+    """Returns the folder of compiled programs for this processor and this jaxlib."""
+    digest = hashlib.sha256(devices.instruction_set().encode()).hexdigest()[:8]
+    return cache_folder() / f"compiled-{devices.version('jaxlib')}-{digest}"

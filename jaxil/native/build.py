@@ -1,8 +1,8 @@
-"""Our own encoder in C, compiled for this machine's processor, known to XLA.
+"""The encoder in C: compiled for this machine's processor, registered with XLA.
 
-XLA's convolutions reach two thirds of what a CPU core can do, and take twice as many
-products as 3x3 kernels need, see `launch/results/speed.md`, 10 and 12. The C compiler
-is the machine's. Where there is none, and on other devices, XLA's own are used.
+XLA's convolutions reach two thirds of what a CPU core can do, and make twice as many
+products as 3x3 kernels need: `launch/results/README.md`, changes 10 and 12. The C
+compiler is the machine's; without one, and on other devices, XLA's own are used.
 """
 
 import ctypes
@@ -16,72 +16,96 @@ import tempfile
 
 import jax
 
-from jaxil.machine import startup
+from jaxil.machine import cache, devices
 
 _SOURCES = pathlib.Path(__file__).parent
 _SOURCE = _SOURCES / "encoder.c"
 _FUNCTIONS = ("jaxil_encode", "jaxil_encode_gradient")
 _COMPILERS = ("gcc", "cc")
 FLAGS = ("-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared")
-_SECONDS = 60.0  # it takes 1
+_COMPILE_SECONDS = 60.0  # it takes 1
+_DIGEST_BYTES = 32  # SHA-256, appended to the library; the loader ignores it
+
+
+class BuildError(Exception):
+    """The library cannot be compiled; the message says why and what helps."""
 
 
 @functools.cache
 def problem() -> str | None:
-    """Compiles the library, unless that was done before, and tells XLA about it.
+    """Loads the library, compiled if need be, and registers its functions with XLA.
 
     Returns:
-      None if it can be used, else why it can't.
+      None if it can be used, else why not.
     """
     if jax.default_backend() != "cpu":
         return f"it is for CPUs, and jax computes on {jax.default_backend()}"
     try:
-        library = ctypes.CDLL(str(build(startup.compilation_folder())))
-    except (BuildError, OSError) as error:
+        path = build(cache.compilation_folder())
+    except BuildError as error:
         return str(error)
-    register(library)
+    try:
+        register(ctypes.CDLL(str(path)))
+    except (AttributeError, OSError) as error:
+        path.unlink(missing_ok=True)  # what the compiler made is no library
+        return str(error)
     return None
 
 
-class BuildError(Exception):
-    """The library can't be compiled; the message says why and what helps."""
-
-
 def register(library: ctypes.CDLL) -> None:
-    """Tells XLA where the functions are that `maths.encoding` calls."""
+    """Tells XLA where the functions are that `native.encoding` calls."""
     for name in _FUNCTIONS:
         target = jax.ffi.pycapsule(getattr(library, name))
         jax.ffi.register_ffi_target(name, target, platform="cpu")
 
 
 def build(folder: pathlib.Path, flags: tuple[str, ...] = FLAGS) -> pathlib.Path:
-    """Returns the library's file in a folder, compiled if it isn't there.
+    """Returns the library's file in a folder; compiles it if it is missing or damaged.
 
     Args:
-      folder: is made; processes may share it, processors may not.
+      folder: made if missing; processes and machines may share it.
       flags: for the compiler.
 
     Raises:
       BuildError: there is no compiler, or it failed.
     """
-    digest = hashlib.sha256(repr(flags).encode())
+    # The last item is what -march=native depends on.
+    key = hashlib.sha256(repr((flags, devices.instruction_set())).encode())
     for source in (_SOURCE, *sorted(_SOURCES.glob("*.h"))):
-        digest.update(source.read_bytes())
-    path = folder / f"encoder-{digest.hexdigest()[:8]}.so"
-    if path.exists():
+        key.update(source.read_bytes())
+    path = folder / f"encoder-{key.hexdigest()[:8]}.so"
+    if _is_whole(path):
         return path
     compiler = os.environ.get("CC") or next(filter(shutil.which, _COMPILERS), None)
     if compiler is None:
-        raise BuildError("there is no GCC: `apt-get install gcc libc6-dev` brings it")
+        raise BuildError("there is no GCC: `apt-get install gcc libc6-dev` installs it")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
             output = pathlib.Path(scratch) / path.name
             _compile(compiler, flags, output)
+            digest = hashlib.sha256(output.read_bytes()).digest()
+            with output.open("ab") as file:
+                file.write(digest)
+                file.flush()
+                os.fsync(file.fileno())
             os.replace(output, path)
     except OSError as error:
-        raise BuildError(f"{folder} can't be written: {error.strerror}") from error
+        raise BuildError(f"{folder} cannot be written: {error.strerror}") from error
     return path
+
+
+def _is_whole(path: pathlib.Path) -> bool:
+    """Returns whether a library ends in the digest of all before it.
+
+    A process that loads a truncated library dies of SIGBUS, so this is checked first.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return False
+    library, digest = content[:-_DIGEST_BYTES], content[-_DIGEST_BYTES:]
+    return hashlib.sha256(library).digest() == digest
 
 
 def _compile(compiler: str, flags: tuple[str, ...], output: pathlib.Path) -> None:
@@ -89,13 +113,16 @@ def _compile(compiler: str, flags: tuple[str, ...], output: pathlib.Path) -> Non
     words = [*compiler.split(), *flags, f"-I{jax.ffi.include_dir()}", _SOURCE]
     try:
         done = subprocess.run(
-            [*words, "-o", output], capture_output=True, text=True, timeout=_SECONDS
+            [*words, "-o", output],
+            capture_output=True,
+            text=True,
+            timeout=_COMPILE_SECONDS,
         )
     except subprocess.TimeoutExpired as error:
-        raise BuildError(f"{compiler} takes more than {_SECONDS:.0f} s") from error
+        raise BuildError(f"{compiler} exceeds {_COMPILE_SECONDS:.0f} s") from error
     except OSError as error:
-        raise BuildError(f"{compiler} can't be run: {error.strerror}") from error
+        raise BuildError(f"{compiler} cannot be run: {error.strerror}") from error
     if done.returncode or not output.exists():
         lines = (done.stderr.strip() or "no message").splitlines()
-        said = next((line for line in lines if "error:" in line), lines[-1])
-        raise BuildError(f"{compiler} can't compile {_SOURCE.name}: {said}")
+        reason = next((line for line in lines if "error:" in line), lines[-1])
+        raise BuildError(f"{compiler} cannot compile {_SOURCE.name}: {reason}")

@@ -40,10 +40,9 @@ def encode(
         x_l[i, j, f] = max(0, z[i, j, f])
         z[i, j, f] = b[f] + sum_{u,v,c} x_{l-1}[s i + u, s j + v, c] k[u, v, c, f]
 
-    `jaxil.native.build` has to be loaded. It can be differentiated once, for the
-    weights; pixels and mean have no gradient. Kernels of 3x3 without stride take
-    another way, see `winograd.h`: it rounds otherwise, and what is not finite spreads
-    by a pixel.
+    `native.build` must have loaded the library. It can be differentiated once, for the
+    weights; pixels and mean have no gradient. Kernels of 3x3 without stride use
+    `winograd.h`, which rounds differently and spreads non-finite values by a pixel.
 
     Args:
       pixels: uint8 [B, H, W, C].

@@ -1,1 +1,1 @@
-"""What `jaxil.benchmark` is made of: clocks, arithmetic, a run taken apart, tables."""
+"""What `jaxil.benchmark` measures, and how it shows the results."""

@@ -1,4 +1,4 @@
-"""How long a call takes: repeated, its first time left out."""
+"""How long a call takes: repeated, after a first call that may compile."""
 
 import time
 from collections.abc import Callable
@@ -9,26 +9,15 @@ import numpy as np
 
 
 class Timing(NamedTuple):
-    """Seconds that one call takes.
+    """Seconds of one call over all repeats."""
 
-    Attributes:
-      median: of all repeats; what is reported, since other processes only ever add.
-      low: the shortest.
-      high: the longest.
-    """
-
-    median: float
+    median: float  # what is reported: other processes only ever add time
     low: float
     high: float
 
 
 def timed(function: Callable[[], Any], repeats: int) -> Timing:
-    """Calls a function once unmeasured, which may compile, then `repeats` times.
-
-    Args:
-      function: what it returns is waited for, since jax computes in the background.
-      repeats: at least 1.
-    """
+    """Times a function, and waits for its result: jax computes asynchronously."""
     jax.block_until_ready(function())
     seconds = []
     for _ in range(repeats):

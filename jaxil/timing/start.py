@@ -1,12 +1,6 @@
-"""How long `jaxil.launch` takes from the command to the agent's first step.
-
-    python -m jaxil.timing.start CONFIG_FILE.py WORKDIR
-
-starts a run and ends it at that step; `seconds_to_first_step` calls that.
-"""
+"""How long a run takes to start: to its first step, and to compile its update."""
 
 import json
-import os
 import pathlib
 import subprocess
 import sys
@@ -15,82 +9,85 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import jax
+from jax.experimental.compilation_cache import compilation_cache
+
 from jaxil.config import Config
 
-_PATIENCE_SECONDS = 600.0  # on two busy cores it takes 20 s
+_TIMEOUT_SECONDS = 600.0  # it takes 20 s on two busy cores
+# A run that ends at its first step, printing the time on a clock that processes share.
+_RUN = """
+import json, os, sys, time
+from jaxil.machine import startup
+startup.prepare()
+from jaxil import command, launch
+from jaxil.environments import suite
+
+def step(self, action):
+    print(json.dumps(time.monotonic()), flush=True)
+    os._exit(0)
+
+suite.PixelEnvironment.step = step
+command.run(launch.main)
+"""
+_CONFIG_FILE = """
+import json, ml_collections
+
+def get_config():
+    return ml_collections.ConfigDict(json.loads({!r}))
+"""
 
 
-def seconds_to_first_step(
+def first_step_seconds(
     config: Config, environment: Mapping[str, str], say: Callable[[str], None]
 ) -> float | None:
-    """Starts a run in a process of its own.
-
-    What was compiled or drawn on this machine before lies in the caches, as for any
-    run but the first.
+    """Returns the time from the command to the first step, with warm caches.
 
     Args:
       config: checked.
       environment: variables that the user has set.
-      say: takes a line on why it was not measured.
-
-    Returns:
-      Seconds, None if the process failed.
+      say: receives a line if the run failed; the result is None then.
     """
-    with tempfile.TemporaryDirectory() as name:
-        folder = pathlib.Path(name)
-        (folder / "config.py").write_text(_config_file(config))
-        words = ["-m", "jaxil.timing.start", str(folder / "config.py"), str(folder)]
+    settings = config.to_dict()
+    settings["num_environments"] = 1  # so that the process itself steps
+    with tempfile.TemporaryDirectory() as folder:
+        file = pathlib.Path(folder, "config.py")
+        file.write_text(_CONFIG_FILE.format(json.dumps(settings)))
+        words = ["-c", _RUN, f"--config={file}", f"--workdir={folder}/run"]
         begin = time.monotonic()
         try:
             finished = subprocess.run(
                 [sys.executable, *words],
                 check=True,
-                # The calling process may have taken most of the accelerator's memory.
+                # This process may hold most of the accelerator's memory.
                 env={**environment, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"},
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 text=True,
-                timeout=_PATIENCE_SECONDS,
+                timeout=_TIMEOUT_SECONDS,
             )
             return json.loads(finished.stdout.splitlines()[-1]) - begin
         except subprocess.CalledProcessError as error:
             reason = next(iter(error.stderr.strip().splitlines()[-1:]), "no message")
         except subprocess.TimeoutExpired:
-            reason = f"it took longer than {_PATIENCE_SECONDS:.0f} s"
+            reason = f"it took longer than {_TIMEOUT_SECONDS:.0f} s"
     say(f"start not measured: {reason}")
     return None
 
 
-def main(config_file: str, workdir: str) -> None:
-    """Runs `jaxil.launch` up to the agent's first step.
+def compile_seconds(lower: Callable[[], Any]) -> float:
+    """Returns the time to trace and compile a program, with nothing cached.
 
-    Prints `time.monotonic()` of that moment, a clock that all processes share, and ends
-    this one at once.
+    This process forgets all its compiled programs, so call it last.
     """
-    from jaxil.machine import startup
-
-    startup.prepare()
-    from jaxil import command, launch
-    from jaxil.environments import suite
-
-    def step(self: suite.PixelEnvironment, action: Any) -> Any:
-        print(json.dumps(time.monotonic()), flush=True)
-        os._exit(0)
-
-    suite.PixelEnvironment.step = step
-    sys.argv = ["launch", f"--config={config_file}", f"--workdir={workdir}/run"]
-    command.run(launch.main)
-
-
-def _config_file(config: Config) -> str:
-    """Returns a config file with every setting in force."""
-    text = json.dumps(config.to_dict())
-    return (
-        "import json\n\nimport ml_collections\n\n\n"
-        "def get_config():\n"
-        f"    return ml_collections.ConfigDict(json.loads({text!r}))\n"
-    )
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+    jax.clear_caches()
+    before = jax.config.values["jax_enable_compilation_cache"]
+    try:
+        jax.config.update("jax_enable_compilation_cache", False)
+        compilation_cache.reset_cache()  # jax looks at the setting only once
+        begin = time.perf_counter()
+        lower().compile()
+        return time.perf_counter() - begin
+    finally:
+        jax.config.update("jax_enable_compilation_cache", before)
+        compilation_cache.reset_cache()

@@ -15,7 +15,7 @@ from jaxil.environments.player import InProcess, Player
 from jaxil.environments.pool import Pool
 from jaxil.environments.suite import PixelEnvironment, known_tasks, make_environment
 from jaxil.errors import Fault
-from jaxil.machine import startup
+from jaxil.machine import memory
 from jaxil.machine.progress import ProgressLine
 from jaxil.native import build
 from jaxil.replay.replay import Replay
@@ -32,7 +32,6 @@ _READING_FIELDS = {
     "action_repeat",
     "observation",
 }
-_ASSUMED_MEMORY = 4 * 2**30  # bytes, where the machine doesn't tell
 
 
 def problems(config: Config) -> list[Fault]:
@@ -196,17 +195,8 @@ def _file_settings(config: Config) -> dict[str, Any]:
         "image_size": config.image_size,
         "observation": config.observation,
         "frame_skip": config.demonstrations.frame_skip,
-        "max_bytes": spare_bytes(),
+        "max_bytes": memory.spare_bytes(),
     }
-
-
-def spare_bytes() -> int:
-    """Returns how much memory demonstrations may take: half of what is available.
-
-    In whole GiB, so that a file read twice is read under the same limit.
-    """
-    available = startup.available_memory_bytes() or _ASSUMED_MEMORY
-    return max(available // 2 // 2**30, 1) * 2**30
 
 
 def make_replay(config: Config, environment: PixelEnvironment) -> Replay:

@@ -39,7 +39,7 @@ class Evaluator:
         experts: ExpertEpisodes | None,
         distance: Closeness | None,
     ) -> None:
-        """See `train.make_run`."""
+        """See `parts.make_parts`."""
         self._config = config
         self._agent = agent
         self.environment = environment

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from jaxil.config import unknown_name
-from jaxil.machine import startup
+from jaxil.machine import devices
 from launch.sweeps import plan, slurm, state
 from launch.sweeps.process import Process
 from launch.sweeps.worker import Place, Worker
@@ -82,7 +82,7 @@ def uses_gpus(cluster: Cluster) -> bool:
     """Returns whether runs will compute on GPUs, told without starting jax."""
     if cluster.name == "slurm":
         return cluster.num_gpus > 0
-    return not startup.uses_cpu()
+    return not devices.uses_cpu()
 
 
 def num_at_once(cluster: Cluster, num_runs: int) -> int:
@@ -190,7 +190,7 @@ def _wait(jobs: Sequence[Any], watch: Callable[[], None]) -> None:
 
 def _gpus() -> list[str]:
     """Returns the NVIDIA devices that jax may use, as CUDA names them."""
-    if startup.uses_cpu() or not startup.has_cuda_device():
+    if devices.uses_cpu() or not devices.has_cuda_device():
         return []
     chosen = os.environ.get("CUDA_VISIBLE_DEVICES")
     if chosen is not None:

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from jaxil.machine import startup
+from jaxil.machine import devices, startup
 from jaxil.machine.cache import cache_folder
 
 OWN_VARIABLES = (
@@ -33,10 +33,10 @@ def _clean_environment(monkeypatch, tmp_path):
         monkeypatch.delenv(name)
     monkeypatch.setenv("JAXIL_CACHE", str(tmp_path))
     monkeypatch.setattr(startup, "gl_works", lambda backend: backend == "osmesa")
-    monkeypatch.setattr(startup, "_version", lambda package: "0.10.2")
-    monkeypatch.setattr(startup, "uses_cpu", lambda: True)
-    monkeypatch.setattr(startup, "_tell_imported_jax", lambda: None)
-    # Can't be undone; the tests of it have processes of their own.
+    monkeypatch.setattr(devices, "version", lambda package: "0.10.2")
+    monkeypatch.setattr(devices, "uses_cpu", lambda: True)
+    monkeypatch.setattr(startup, "_configure_imported_jax", lambda: None)
+    # This is permanent; its tests have processes of their own.
     monkeypatch.setattr(startup, "_keep_freed_memory", lambda: None)
 
 
@@ -84,8 +84,8 @@ def test_a_users_own_choice_of_the_flag_stays(monkeypatch):
     ("version", "on_cpu"), [("0.10.1", True), ("0.11.0", True), ("0.10.2", False)]
 )
 def test_the_flag_goes_only_where_it_is_known_and_of_use(monkeypatch, version, on_cpu):
-    monkeypatch.setattr(startup, "_version", lambda package: version)
-    monkeypatch.setattr(startup, "uses_cpu", lambda: on_cpu)
+    monkeypatch.setattr(devices, "version", lambda package: version)
+    monkeypatch.setattr(devices, "uses_cpu", lambda: on_cpu)
     startup.prepare()
     assert "XLA_FLAGS" not in os.environ
 
@@ -142,27 +142,27 @@ def test_a_backend_that_does_not_exist_does_not_work(monkeypatch):
 def test_the_users_platform_decides(monkeypatch, platforms, expected):
     monkeypatch.undo()
     monkeypatch.setenv("JAX_PLATFORMS", platforms)
-    assert startup.uses_cpu() is expected
+    assert devices.uses_cpu() is expected
 
 
 def test_a_device_without_a_plugin_leaves_the_cpu(monkeypatch):
     monkeypatch.undo()
     monkeypatch.delenv("JAX_PLATFORMS", raising=False)
-    monkeypatch.setattr(startup, "has_cuda_device", lambda: True)
+    monkeypatch.setattr(devices, "has_cuda_device", lambda: True)
     for plugins, expected in (([], True), (["cuda"], False)):
         found = plugins
         monkeypatch.setattr(
-            startup.importlib.metadata, "entry_points", lambda group, f=found: f
+            devices.importlib.metadata, "entry_points", lambda group, f=found: f
         )
-        assert startup.uses_cpu() is expected
+        assert devices.uses_cpu() is expected
 
 
 def test_hidden_devices_are_not_there(monkeypatch):
-    monkeypatch.setattr(startup.glob, "glob", lambda pattern: ["/dev/nvidia0"])
+    monkeypatch.setattr(devices.glob, "glob", lambda pattern: ["/dev/nvidia0"])
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    assert startup.has_cuda_device()
+    assert devices.has_cuda_device()
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    assert not startup.has_cuda_device()
+    assert not devices.has_cuda_device()
 
 
 def test_the_cache_is_where_the_user_wants_it(monkeypatch, tmp_path):
@@ -173,70 +173,6 @@ def test_the_cache_is_where_the_user_wants_it(monkeypatch, tmp_path):
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     assert cache_folder() == tmp_path / "home" / ".cache" / "jaxil"
-
-
-# --- memory ---------------------------------------------------------------------------
-
-
-def machine(root, files):
-    for name, text in files.items():
-        (root / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).write_text(text)
-    return root
-
-
-MEMINFO = {"proc/meminfo": "MemTotal:  2000 kB\nMemAvailable:    1000 kB\n"}
-
-
-@pytest.mark.parametrize(
-    ("files", "expected"),
-    [
-        ({}, None),
-        (MEMINFO, 1_024_000),
-        (
-            # A container: 500000 of which 200000 are used, 50000 of them file cache.
-            MEMINFO
-            | {
-                "sys/fs/cgroup/memory.max": "500000\n",
-                "sys/fs/cgroup/memory.current": "200000\n",
-                "sys/fs/cgroup/memory.stat": "anon 1\ninactive_file 50000\n",
-            },
-            350_000,
-        ),
-        (
-            MEMINFO
-            | {
-                "sys/fs/cgroup/memory.max": "max\n",
-                "sys/fs/cgroup/memory.current": "200000\n",
-            },
-            1_024_000,
-        ),
-        (
-            # A batch job: the limit is on a parent of the process's own group.
-            MEMINFO
-            | {
-                "proc/self/cgroup": "0::/slurm/job_1/step_0\n",
-                "sys/fs/cgroup/slurm/job_1/memory.max": "300000\n",
-                "sys/fs/cgroup/slurm/job_1/memory.current": "100000\n",
-                "sys/fs/cgroup/slurm/job_1/step_0/memory.max": "max\n",
-                "sys/fs/cgroup/slurm/job_1/step_0/memory.current": "90000\n",
-            },
-            200_000,
-        ),
-        (
-            # The older layout, over its limit: nothing is left.
-            MEMINFO
-            | {
-                "proc/self/cgroup": "3:cpu:/a\n2:memory:/a\n",
-                "sys/fs/cgroup/memory/a/memory.limit_in_bytes": "1000\n",
-                "sys/fs/cgroup/memory/a/memory.usage_in_bytes": "2000\n",
-            },
-            0,
-        ),
-    ],
-)
-def test_the_tightest_limit_counts(tmp_path, files, expected):
-    assert startup.available_memory_bytes(machine(tmp_path, files)) == expected
 
 
 _NEW_PAGES = """

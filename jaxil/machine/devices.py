@@ -1,0 +1,103 @@
+"""Processor and accelerator: what is there, what jax computes on, its memory.
+
+Only functions that ask jax import it, so that start-up can use the others first.
+"""
+
+import glob
+import importlib.metadata
+import importlib.util
+import os
+import pathlib
+import platform
+from typing import Any
+
+
+def has_cuda_device() -> bool:
+    """Returns whether there is an NVIDIA device that is not hidden from CUDA."""
+    if os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1"):
+        return False
+    return bool(glob.glob("/dev/nvidia[0-9]*")) or os.path.exists("/dev/dxg")
+
+
+def uses_cpu() -> bool:
+    """Returns whether jax will compute on the CPU, without importing jax."""
+    platforms = os.environ.get("JAX_PLATFORMS", "")
+    if platforms:
+        return platforms.split(",")[0].strip() == "cpu"
+    has_plugin = bool(importlib.metadata.entry_points(group="jax_plugins"))
+    on_gpu = has_plugin and (has_cuda_device() or os.path.exists("/dev/kfd"))
+    on_tpu = importlib.util.find_spec("libtpu") is not None and bool(
+        glob.glob("/dev/accel[0-9]*") or glob.glob("/dev/vfio/[0-9]*")
+    )
+    return not (on_gpu or on_tpu)
+
+
+def version(package: str) -> str | None:
+    """Returns the installed version of a package, None without it."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def instruction_set() -> str:
+    """Returns what decides which machine code runs here: the CPU's model and features.
+
+    Home folders are shared between machines; code that was compiled for one processor
+    may contain instructions that another lacks.
+    """
+    return "\n".join(
+        sorted({s for s in _cpuinfo() if s.startswith(("model name", "flags"))})
+    )
+
+
+def device_name() -> str:
+    """Returns what jax computes on, such as "gpu: NVIDIA H100"."""
+    import jax
+
+    device = jax.devices()[0]
+    return f"{device.platform}: {device.device_kind}"
+
+
+def free_bytes() -> int | None:
+    """Returns what jax may still allocate on its device; None where unknown.
+
+    Unknown for CPUs too, whose memory is the host's.
+    """
+    statistics = _memory_statistics()
+    if "bytes_limit" not in statistics:
+        return None
+    return statistics["bytes_limit"] - statistics.get("bytes_in_use", 0)
+
+
+def peak_bytes() -> int | None:
+    """Returns the most that jax has allocated on its device; None where unknown."""
+    return _memory_statistics().get("peak_bytes_in_use")
+
+
+def describe() -> dict[str, Any]:
+    """Returns what a measurement was made on."""
+    import jax
+
+    processors = (s.split(":")[1].strip() for s in _cpuinfo() if "model name" in s)
+    return {
+        "device": device_name(),
+        "num_devices": jax.device_count(),
+        "machine": platform.platform(),
+        "processor": next(processors, platform.processor()),
+        "cores": os.cpu_count(),
+        "usable_cores": len(os.sched_getaffinity(0)),
+    }
+
+
+def _memory_statistics() -> dict[str, int]:
+    import jax
+
+    return jax.devices()[0].memory_stats() or {}
+
+
+def _cpuinfo() -> list[str]:
+    try:
+        return pathlib.Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return []

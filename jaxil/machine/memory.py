@@ -1,0 +1,79 @@
+"""How much of the host's memory this process may still use."""
+
+import pathlib
+import resource
+
+_ASSUMED_BYTES = 4 * 2**30  # where the machine does not tell
+
+
+def available_bytes(root: pathlib.Path = pathlib.Path("/")) -> int | None:
+    """Returns the memory that this process may still allocate, None where unknown.
+
+    The smaller of what the machine has free and what its control groups (the limit of
+    a container or a batch job) leave; file caches count as free.
+
+    Args:
+      root: where /proc and /sys are; for tests.
+    """
+    meminfo = _read_fields(root / "proc/meminfo")
+    bounds = [1024 * meminfo[name] for name in ("MemAvailable",) if name in meminfo]
+    for group in _control_groups(root):
+        for limit_file, usage_file, cache_field in (
+            ("memory.max", "memory.current", "inactive_file"),
+            ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+        ):
+            limit = _read_number(group / limit_file)
+            usage = _read_number(group / usage_file)
+            if limit is not None and usage is not None:
+                cached = _read_fields(group / "memory.stat").get(cache_field, 0)
+                bounds.append(max(limit - max(usage - cached, 0), 0))
+    return min(bounds, default=None)
+
+
+def spare_bytes() -> int:
+    """Returns how much memory demonstrations may use: half of what is available.
+
+    In whole GiB, so that a file that is read twice is read under the same limit.
+    """
+    available = available_bytes() or _ASSUMED_BYTES
+    return max(available // 2 // 2**30, 1) * 2**30
+
+
+def peak_bytes() -> int:
+    """Returns the most memory that this process has occupied so far."""
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def _control_groups(root: pathlib.Path) -> list[pathlib.Path]:
+    """Returns the folders of this process's control groups and of their parents."""
+    try:
+        lines = (root / "proc/self/cgroup").read_text().splitlines()
+    except OSError:
+        lines = []
+    base = root / "sys/fs/cgroup"
+    folders = {base, base / "memory"}
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        here = pathlib.PurePosixPath(path.lstrip("/"))
+        hierarchy = base / "memory" if controllers else base
+        folders.update(hierarchy / part for part in (here, *here.parents))
+    return sorted(folders)
+
+
+def _read_fields(path: pathlib.Path) -> dict[str, int]:
+    """Reads lines such as "MemAvailable:  123 kB" or "inactive_file 123"."""
+    try:
+        words = [line.split() for line in path.read_text().splitlines()]
+    except OSError:
+        return {}
+    return {w[0].rstrip(":"): int(w[1]) for w in words if len(w) > 1 and w[1].isdigit()}
+
+
+def _read_number(path: pathlib.Path) -> int | None:
+    """Reads a file of one number; None where it is missing or says "max"."""
+    try:
+        return int(path.read_text())
+    except (OSError, ValueError):
+        return None

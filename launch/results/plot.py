@@ -1,0 +1,91 @@
+r"""Plots learning.png from RUN/eval.csv, and cost.png from cost_*.json, all beside it.
+
+    python -m jaxil.benchmark --config=configs/psil.py:cartpole_swingup \
+        --sweep=batch_size:32,64,128,256 --json=launch/results/cost_batch_size.json
+    python launch/results/plot.py
+"""
+
+import collections
+import json
+import pathlib
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from jaxil.files.metrics import read_csv
+
+_HERE = pathlib.Path(__file__).parent
+_EPISODE_FRAMES = 1000
+_PRESET = "cartpole_swingup_pdac_repeat4_penalty1"
+# Field that was swept: x label, row of the benchmark, y label.
+_REWARD = ("reward_ms", "rewards of an episode, ms")
+_PANELS = {
+    "batch_size": ("batch size", "update_ms", "update, ms"),
+    "image_size": ("image side, pixels", "update_ms", "update, ms"),
+    "demonstrations.num_episodes": ("demonstrations", *_REWARD),
+    "action_repeat": ("agent steps of an episode", *_REWARD),
+    "num_environments": ("environments", "frames_per_second", "frames per second"),
+}
+
+
+def plot_learning() -> None:
+    """Plots one line for each run: a panel for each task, one for the preset."""
+    panels = collections.defaultdict(list)
+    for path in sorted(_HERE.glob("*/eval.csv")):
+        name, config = path.parent.name, path.parent / "config.json"
+        task = json.loads(config.read_text())["config"]["task"]
+        title = f"{task}, P-DAC's preset" if _PRESET in name else task
+        panels[title].append((name.removeprefix(f"{task}_"), read_csv(path)))
+    grid = _axes(-(-len(panels) // 2), 2, width=5.2, height=5.2)
+    for axes, (title, runs) in zip(grid, sorted(panels.items())):
+        expert = max(table["expert_task_return_mean"][-1] for _, table in runs)
+        axes.axhline(expert, color="#444444", ls="--", lw=1.2, label="expert")
+        axes.axhline(0.8 * expert, color="#444444", ls=":", label="80 % of it")
+        for name, table in runs:
+            axes.plot(
+                table["frame"] / 1000, table["task_return_mean"], "o-", ms=2, label=name
+            )
+        axes.set(title=title, xlim=(0, None), ylim=(0, 1050))
+        axes.set(xlabel="environment frames / 1000", ylabel="task return")
+        place = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16)}
+        axes.legend(**place, frameon=False, fontsize=7)
+    for axes in grid[len(panels) :]:
+        axes.set_axis_off()
+    grid[0].figure.savefig(_HERE / "learning.png")
+
+
+def plot_cost() -> None:
+    """Plots a panel for each sweep of the benchmark: median and range."""
+    found = [json.loads(path.read_text()) for path in _HERE.glob("cost_*.json")]
+    sweeps = {results[0]["sweep"]["field"]: results for results in found}
+    fields = [field for field in _PANELS if field in sweeps]
+    for axes, field in zip(_axes(1, len(fields), width=3.4, height=3.2), fields):
+        results, (xlabel, row, ylabel) = sweeps[field], _PANELS[field]
+        x = [result["sweep"]["value"] for result in results]
+        if field == "action_repeat":
+            x = [_EPISODE_FRAMES / repeat for repeat in x]
+        if row in results[0]["ranges"]:
+            low, high = zip(*(result["ranges"][row] for result in results))
+            axes.fill_between(x, low, high, alpha=0.15)
+        axes.plot(x, [result[row] for result in results], "o-")
+        config = results[0]["config"]
+        axes.set_title(f"{config['method']}, {config['task']}", fontsize=8)
+        axes.set(xlabel=xlabel, ylabel=ylabel, xticks=x)
+        axes.set_ylim(0, 1.05 * axes.get_ylim()[1])
+        axes.figure.savefig(_HERE / "cost.png")
+
+
+def _axes(rows: int, columns: int, *, width: float, height: float) -> list:
+    size = (width * columns, height * rows)
+    figure = Figure(figsize=size, dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
+    for axes in panels:
+        axes.grid(axis="y", alpha=0.25)
+        axes.spines[["top", "right"]].set_visible(False)
+    return panels
+
+
+if __name__ == "__main__":
+    plot_learning()
+    plot_cost()
