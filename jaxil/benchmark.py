@@ -83,7 +83,7 @@ def _flag_problems(values: flags.FlagValues) -> list[str]:
 def _write(path: str | None, results: Any) -> None:
     if path is None:
         return
-    from jaxil.files.metrics import write_atomically
+    from jaxil.files.writing import write_atomically
 
     try:
         write_atomically(path, (json.dumps(results, indent=2) + "\n").encode())

@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import functools
 import pathlib
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -24,6 +23,7 @@ from jaxil.environments.interaction import (
 )
 from jaxil.environments.pool import EnvironmentsFailed
 from jaxil.learner.state import TrainState
+from jaxil.machine import screen
 from jaxil.machine.progress import ProgressLine
 from jaxil.machine.signals import StopOnSignals
 from jaxil.maths.types import Episode
@@ -508,7 +508,7 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
     """
 
     def say(text: str) -> None:
-        print(text, file=sys.stderr, flush=True)
+        screen.say(text)
 
     demonstrations = assembly.load_demonstrations(config)
     say(f"{config.task}: {METHODS[config.method]}, seed {config.seed}")

@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from jaxil.files.metrics import read_csv
+from jaxil.files.tables import read_csv
 from tests.commands import ROOT, arguments, run, small_run
 
 _CLOCKS = ("seconds", "frames_per_second", "reward_seconds")

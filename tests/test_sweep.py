@@ -12,7 +12,7 @@ import types
 import pytest
 
 from jaxil import train
-from jaxil.files.metrics import read_csv
+from jaxil.files.tables import read_csv
 from launch.sweeps import clusters, cost, plan, state, tables
 from launch.sweeps.clusters import Cluster
 from launch.sweeps.faults import Faulty

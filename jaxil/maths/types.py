@@ -5,13 +5,14 @@ K demonstrations, H W C pixels (channels last, the stack folded into C),
 S state vector, R representation, D feature, A action.
 """
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jax import Array
+if TYPE_CHECKING:  # host code imports this file, and jax takes a second
+    from jax import Array
 
 Params = Any  # a pytree of arrays, as flax makes it
 Data = Any  # an array: NumPy's on the host, jax's inside jitted functions
-Metrics = dict[str, Array]  # scalars, left on the device until they are logged
+Metrics = dict[str, "Array"]  # scalars, left on the device until they are logged
 
 
 class Window(NamedTuple):

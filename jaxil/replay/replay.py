@@ -1,68 +1,30 @@
-"""The replay: a NumPy ring of single frames, from which n-step windows are drawn.
+"""The replay: a NumPy ring of single frames, from which n-step windows are sampled.
 
 Each frame is stored once and stacks are made when they are sampled, so that the paper's
-150000 steps of 84x84 pixels take 3.2 GB (stored stacks would take 9.5 GB). Whole
-episodes enter, and the oldest whole episodes leave.
+150000 steps of 84x84 pixels take 3.2 GB (stored stacks would take 9.5 GB).
 
 Axes: B batch, T steps of an episode, n the length of a window, H W C pixels.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
+from jaxil.maths.types import Batch, Window
 from jaxil.replay.episode import require
 from jaxil.replay.ring import EpisodeRing, ring_slots
 from jaxil.replay.stacking import gather_stacks
 
 
-class Window(NamedTuple):
-    """All transitions of n-step windows, for methods that reward them anew."""
-
-    observation: np.ndarray  # [B, n, H, W, C * stack] uint8, or [B, n, S] float32
-    action: np.ndarray  # [B, n, A] float32
-    weight: np.ndarray  # [B, n] float32: what each reward is multiplied by in the sum
-
-
-class Batch(NamedTuple):
-    """Transitions over n steps, as the learner gets them.
-
-    From `sample_indices`, with slots of frames in the place of pixels.
-    """
-
-    observation: np.ndarray  # [B, H, W, C * stack] uint8, or [B, S] float32: o_t
-    action: np.ndarray  # [B, A] float32: a_t
-    reward: np.ndarray  # [B] float32: discounted sum of r_t ... r_{t+n-1}
-    discount: np.ndarray  # [B] float32: what the value of o_{t+n} is multiplied by
-    next_observation: np.ndarray  # like observation: o_{t+n}
-    window: Window | None  # None unless asked for
-
-
-def memory_bytes(
-    *,
-    capacity_steps: int,
-    episode_steps: int,
-    observation_shape: tuple[int, ...],
-    observation_dtype,
-    action_dim: int,
-) -> int:
-    """Says how much memory a full replay of these sizes takes, in bytes.
+def memory_bytes(*, action_dim: int, **sizes) -> int:
+    """Returns how much memory a full replay takes, in bytes.
 
     Args:
-      capacity_steps: transitions kept at most.
-      episode_steps: transitions of a usual episode; it has one frame more than that.
-      observation_shape: shape of a single frame, (H, W, C), or of a state, (S,).
-      observation_dtype: dtype of a frame.
       action_dim: A.
+      **sizes: see `frames_bytes`.
     """
-    frames = frames_bytes(
-        capacity_steps=capacity_steps,
-        episode_steps=episode_steps,
-        observation_shape=observation_shape,
-        observation_dtype=observation_dtype,
-    )
-    return frames + ring_slots(capacity_steps, episode_steps) * 4 * (action_dim + 2)
+    slots = ring_slots(sizes["capacity_steps"], sizes["episode_steps"])
+    return frames_bytes(**sizes) + slots * 4 * (action_dim + 2)
 
 
 def frames_bytes(
@@ -72,66 +34,54 @@ def frames_bytes(
     observation_shape: tuple[int, ...],
     observation_dtype,
 ) -> int:
-    """Says how much of `memory_bytes` is frames, of which a device may hold a copy."""
+    """Returns how much of it is frames, of which a device may hold a copy.
+
+    Args:
+      capacity_steps: transitions kept at most.
+      episode_steps: transitions of a usual episode.
+      observation_shape: shape of a single frame, (H, W, C), or of a state, (S,).
+      observation_dtype: dtype of a frame.
+    """
     frame_bytes = math.prod(observation_shape) * np.dtype(observation_dtype).itemsize
     return ring_slots(capacity_steps, episode_steps) * frame_bytes
 
 
 class Replay(EpisodeRing):
-    """Stores the newest episodes and draws n-step transitions from them, uniformly."""
+    """Stores the newest episodes and samples n-step transitions from them."""
 
     def __init__(
-        self,
-        *,
-        capacity_steps: int,
-        episode_steps: int,
-        observation_shape: tuple[int, ...],
-        observation_dtype,
-        action_dim: int,
-        frame_stack: int,
-        num_steps: int,
-        discount_factor: float,
+        self, *, frame_stack: int, num_steps: int, discount_factor: float, **sizes
     ):
-        """Reserves the memory; the system hands it out as it is written to.
+        """Reserves the memory.
 
         Args:
-          capacity_steps: transitions kept at most, >= episode_steps.
-          episode_steps: transitions of a usual episode (see `memory_bytes`), >= 1.
-          observation_shape: shape of a single frame, (H, W, C), or of a state, (S,).
-          observation_dtype: uint8 for pixels, float32 for states.
-          action_dim: A >= 1.
           frame_stack: frames in an observation, >= 1; 1 for states.
           num_steps: n >= 1, the steps that a sampled transition spans.
           discount_factor: gamma in [0, 1].
+          **sizes: see `EpisodeRing`.
 
         Raises:
           ValueError: if a number breaks its rule.
         """
+        super().__init__(**sizes)
         require(frame_stack >= 1, "frame_stack", frame_stack, ">= 1")
         require(num_steps >= 1, "num_steps", num_steps, ">= 1")
         in_range = 0 <= discount_factor <= 1
         require(in_range, "discount_factor", discount_factor, "in [0, 1]")
-        stackable = len(observation_shape) != 1 or frame_stack == 1
+        stackable = self._frames.ndim != 2 or frame_stack == 1
         require(stackable, "frame_stack", frame_stack, "1 for states")
-        super().__init__(
-            capacity_steps=capacity_steps,
-            episode_steps=episode_steps,
-            observation_shape=observation_shape,
-            observation_dtype=observation_dtype,
-            action_dim=action_dim,
-        )
         self._frame_stack = frame_stack
         self._window = num_steps
         self._discount_factor = discount_factor
 
     def can_sample(self) -> bool:
-        """Says whether any stored episode is long enough for a window of n steps."""
+        """Returns whether any stored episode has a window of n steps."""
         return bool(self._num_windows().any())
 
     def sample(
         self, rng: np.random.Generator, batch_size: int, *, windows: bool = False
     ) -> Batch:
-        """Draws transitions, uniformly with replacement from all windows of n steps.
+        """Samples transitions, uniformly with replacement from all windows of n steps.
 
         reward = sum_{k<n} gamma^k d_t ... d_{t+k-1} r_{t+k}, and
         discount = gamma^n d_t ... d_{t+n-1}, with d the environment's discounts.
@@ -139,9 +89,9 @@ class Replay(EpisodeRing):
         start.
 
         Args:
-          rng: source of the draw; it is advanced by one call.
+          rng: it is advanced by one call.
           batch_size: B >= 1.
-          windows: whether to add each window's own transitions.
+          windows: whether to add all of each window's transitions.
 
         Returns:
           A batch of fresh arrays in C order.
@@ -149,33 +99,28 @@ class Replay(EpisodeRing):
         Raises:
           ValueError: if no stored episode is as long as a window.
         """
-        drawn = self.sample_indices(rng, batch_size, windows=windows)
-        # Both ends of the windows in one go: the work is shared out among threads.
-        # Where all of a window is asked for, its inside comes first of all.
-        first = drawn.observation[None]
-        if drawn.window is not None:
-            first = drawn.window.observation.swapaxes(0, 1)
-        slots = np.concatenate([first, drawn.next_observation[None]])
+        batch = self.sample_indices(rng, batch_size, windows=windows)
+        # All stacks in one call, which shares the work out among threads. Those of a
+        # whole window include its first observation.
+        first = batch.observation[None]
+        if batch.window is not None:
+            first = batch.window.observation.swapaxes(0, 1)
+        slots = np.concatenate([first, batch.next_observation[None]])
         stacks = gather_stacks(self._frames, slots.reshape(-1, self._frame_stack))
         stacks = stacks.reshape(*slots.shape[:2], *stacks.shape[1:])
-        if drawn.window is not None:
+        if batch.window is not None:
             inside = np.ascontiguousarray(stacks[:-1].swapaxes(0, 1))
-            drawn = drawn._replace(window=drawn.window._replace(observation=inside))
-        return drawn._replace(observation=stacks[0], next_observation=stacks[-1])
+            batch = batch._replace(window=batch.window._replace(observation=inside))
+        return batch._replace(observation=stacks[0], next_observation=stacks[-1])
 
     def sample_indices(
         self, rng: np.random.Generator, batch_size: int, *, windows: bool = False
     ) -> Batch:
-        """Draws what `sample` draws, with the places of frames instead of pixels.
-
-        Args:
-          rng: see `sample`; the same one gives the same transitions.
-          batch_size: B >= 1.
-          windows: see `sample`.
+        """Samples what `sample` does, with indices of frames in place of pixels.
 
         Returns:
           A batch in which each stack [H, W, C * stack] is the int32 [stack] of its
-          frames' slots in `frames`, the oldest first. They hold until the next
+          frames' indices in `frames`, the oldest first. They are valid until the next
           episode is added.
 
         Raises:
@@ -187,7 +132,7 @@ class Replay(EpisodeRing):
                 f"num_steps_stored = {self._num_steps_stored}: expected an episode of"
                 f" at least {self._window} steps; add one before sampling"
             )
-        # Laid end to end, so that one draw picks an episode and a time t in it.
+        # Laid end to end, so that one number picks an episode and a time t in it.
         ends = np.cumsum(num_windows)
         flat = rng.integers(int(ends[-1]), size=batch_size)
         which = np.searchsorted(ends, flat, side="right")
@@ -224,10 +169,9 @@ class Replay(EpisodeRing):
         return np.maximum(self._lengths - self._window + 1, 0)
 
     def _stack_slots(self, starts: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        """Says where the frames of o_t lie, of episodes that begin in slots `starts`.
+        """Returns the slots of each o_t's frames, for episodes that begin at `starts`.
 
-        Returns:
-          int32, a last axis of frames added, the oldest first.
+        They are int32, along a new last axis, the oldest first.
         """
         ages = np.arange(self._frame_stack)[::-1]
         slots = starts[..., None] + np.maximum(steps[..., None] - ages, 0)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from jaxil.command import UsageError
+from jaxil.files.settings import as_stored, flat
 from jaxil.timing.tables import ROWS
 
 # Whatever jaxil wrote the file, old or new, it has these.
@@ -58,7 +59,7 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
         for name in _CIRCUMSTANCES
         if name in old and old[name] != new.get(name)
     ]
-    before, now = _flat(old["config"]), _flat(new["config"])
+    before, now = (flat(as_stored(each["config"])) for each in (old, new))
     missing = object()
     for field in sorted(before.keys() | now.keys()):
         values = before.get(field, missing), now.get(field, missing)
@@ -71,15 +72,3 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _flat(config: Any) -> dict[str, Any]:
-    """Returns a config's fields by their dotted names, as JSON has them."""
-    leaves: dict[str, Any] = {}
-    for name, value in json.loads(json.dumps(config)).items():
-        if isinstance(value, dict):
-            inner = _flat(value)
-            leaves |= {f"{name}.{below}": leaf for below, leaf in inner.items()}
-        else:
-            leaves[name] = value
-    return leaves

@@ -16,11 +16,11 @@ from jaxil.training.checkpoint import CheckpointError, Checkpoints
 
 
 class Trained(NamedTuple):
-    """What it takes to play a learned policy.
+    """A learned policy and what it takes to play it.
 
     Attributes:
       config: the run's settings.
-      environment: one of its own, apart from the training's.
+      environment: a separate one, not the training's.
       act: observation -> mean action.
       params: of encoder, actor and critic.
       demonstrations: what the run imitates; None without.
@@ -39,7 +39,7 @@ class Trained(NamedTuple):
     seconds: float
 
     def description(self) -> str:
-        """Says in a few words how the policy came to be."""
+        """Returns a few words on the training."""
         config = self.config
         return (
             f"{config.method} learner on {config.observation}, seed {config.seed}, "
@@ -48,13 +48,13 @@ class Trained(NamedTuple):
 
 
 def load(folder: pathlib.Path) -> Trained:
-    """Reads the newest whole checkpoint of a run; the run may be going on.
+    """Reads the newest whole checkpoint of a run, which may still be running.
 
     Args:
       folder: `--workdir` of the run.
 
     Raises:
-      UsageError: there is no run, no checkpoint, or it can't be read.
+      UsageError: there is no run, no checkpoint, or none can be read.
     """
     config = workdir.read_config(folder)
     faults = assembly.problems(config)

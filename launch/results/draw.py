@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from jaxil.files.metrics import read_csv
+from jaxil.files.tables import read_csv
 
 _HERE = pathlib.Path(__file__).parent
 _COLOURS = {"pdac": "#1f6f8b", "psil": "#c8553d", "drqv2": "#588157", "zero": "#777777"}
