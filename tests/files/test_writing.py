@@ -51,7 +51,8 @@ def test_what_killed_processes_left_is_removed(tmp_path):
     remove_leftovers(tmp_path, min_age_seconds=60.0)
     assert len(list(tmp_path.iterdir())) == 10  # others may be writing them now
     for path in tmp_path.iterdir():
-        os.utime(path, (time.time() - 61,) * 2)
+        before = time.time() - 61
+        os.utime(path, (before, before))
     remove_leftovers(tmp_path, min_age_seconds=60.0)
 
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(kept)
