@@ -112,11 +112,10 @@ def test_a_full_disk_under_the_events_is_the_same(make_outputs, tmp_path, monkey
             write_episode(outputs)
 
 
-@pytest.mark.parametrize("how", [shutil.rmtree, lambda path: path.rename("moved")])
-def test_a_folder_that_is_gone_is_one_sentence(
-    make_outputs, tmp_path, monkeypatch, how
-):
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.parametrize(
+    "remove", [shutil.rmtree, lambda path: path.rename(path.with_name("moved"))]
+)
+def test_a_folder_that_is_gone_is_one_sentence(make_outputs, tmp_path, remove):
     folder = tmp_path / "run"
     folder.mkdir()
     outputs = make_outputs(folder)
