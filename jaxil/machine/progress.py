@@ -127,7 +127,7 @@ class ProgressLine:
             shown = " ".join(f"{name} {value:.1f}" for name, value in returns.items())
             parts.append(f"return {shown}")
         if speed > 0 and not task.finished:
-            parts.append(f"{duration(task.remaining / speed)} left")
+            parts.append(f"{duration((task.remaining or 0.0) / speed)} left")
         return " | ".join(parts)
 
 

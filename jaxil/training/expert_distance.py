@@ -108,7 +108,7 @@ class Closeness:
         )
         environment.close()
         # Not zero, which it may be where the expert acts at random too.
-        distance = max(self._distance(played.episodes), np.finfo(np.float32).tiny)
+        distance = max(self._distance(played.episodes), 1e-12)
         content = {"distance": distance, "task_return_mean": played.mean}
         content |= {"definition": _DEFINITION}
         content |= {"checksum": _checksum(content)}

@@ -223,13 +223,14 @@ class _Events:
         from tensorboardX import event_file_writer  # slow to import
         from tensorboardX.proto import event_pb2
 
+        messages: Any = event_pb2  # whose classes are made at run time
         folder.mkdir(exist_ok=True)
         # Not its SummaryWriter, whose thread dies of a full disk, and with it the
         # program: it then waits for the thread without end.
         self._writer = event_file_writer.EventsWriter(str(folder / "events"))
-        self._event = event_pb2.Event
+        self._event = messages.Event
         if resume_frame is not None:
-            start = event_pb2.SessionLog(status=event_pb2.SessionLog.START)
+            start = messages.SessionLog(status=messages.SessionLog.START)
             self._write(step=resume_frame + 1, session_log=start)
 
     def write(self, group: str, row: Mapping[str, Any]) -> None:

@@ -16,27 +16,16 @@ from jaxil.training.checkpoint import CheckpointError, Checkpoints
 
 
 class Trained(NamedTuple):
-    """A learned policy and what it takes to play it.
-
-    Attributes:
-      config: the run's settings.
-      environment: a separate one, not the training's.
-      act: observation -> mean action.
-      params: of encoder, actor and critic.
-      demonstrations: what the run imitates; None without.
-      frame: environment frames that the policy was trained for.
-      episode: training episodes so far.
-      seconds: wall-clock of the training.
-    """
+    """A learned policy and what it takes to play it."""
 
     config: Config
-    environment: PixelEnvironment
-    act: Callable[[np.ndarray], np.ndarray]
+    environment: PixelEnvironment  # a separate one, not the training's
+    act: Callable[[np.ndarray], np.ndarray]  # observation -> mean action
     params: LearnerParams
     demonstrations: loading.Demonstrations | None
-    frame: int
-    episode: int
-    seconds: float
+    frame: int  # environment frames of training
+    episode: int  # training episodes
+    seconds: float  # wall clock of the training
 
     def description(self) -> str:
         """Returns a few words on the training."""

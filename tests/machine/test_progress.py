@@ -51,7 +51,7 @@ def test_a_terminal_has_one_live_line_and_messages_above(monkeypatch):
     assert shown.count("[run]: 30/10000 frames") >= 1
     assert "[run]: 5/" not in shown
     assert shown.count("[saved]" + "x" * 200) == 1
-    assert shown.endswith("\n")
+    assert "\n" in shown[-8:]  # what follows is only the cursor's return
 
 
 def test_a_dumb_terminal_gets_plain_lines(monkeypatch):
