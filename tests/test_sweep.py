@@ -131,7 +131,7 @@ def test_every_fault_of_every_run_is_told_once(tmp_path):
         "--methods='gail' is unknown",
         "--ablation='figure1' is unknown",
         "--seeds=0 must be at least 1",
-        "can't be written",
+        "not writable",
         "--config.seed=3 is what the sweep itself sets: use --seeds",
         "field='batchsize' is unknown; did you mean: batch_size",
     )
