@@ -31,7 +31,8 @@ def checked_episode(frames, actions, rewards, discounts, *, like: Episode) -> Ep
       ValueError: for a wrong shape or dtype, or a number that is out of range.
     """
     frames = np.asarray(frames)
-    shape, dtype = frames.shape, frames.dtype
+    shape: tuple[int, ...] = frames.shape
+    dtype = frames.dtype
     require(
         len(shape) > 0 and shape[0] > 1, "frames.shape", shape, "at least two frames"
     )
