@@ -31,19 +31,17 @@ def checked_episode(frames, actions, rewards, discounts, *, like: Episode) -> Ep
       ValueError: for a wrong shape or dtype, or a number that is out of range.
     """
     frames = np.asarray(frames)
-    shape: tuple[int, ...] = frames.shape
-    dtype = frames.dtype
-    require(
-        len(shape) > 0 and shape[0] > 1, "frames.shape", shape, "at least two frames"
-    )
-    expected = (shape[0], *like.frames.shape[1:])
+    shape, dtype = frames.shape, frames.dtype
+    num_frames = len(frames) if frames.ndim > 0 else 0
+    require(num_frames > 1, "frames.shape", shape, "at least two frames")
+    expected = (num_frames, *like.frames.shape[1:])
     require(shape == expected, "frames.shape", shape, expected)
     require(dtype == like.frames.dtype, "frames.dtype", dtype, like.frames.dtype)
     _require_all(np.isfinite(frames), "frames", frames, "finite")
 
     def checked(name: str, values) -> np.ndarray:
         ring = getattr(like, name)
-        shape = (len(frames) - 1, *ring.shape[1:])
+        shape = (num_frames - 1, *ring.shape[1:])
         return checked_values(name, values, np.empty(shape, ring.dtype))
 
     discounts = checked("discounts", discounts)
