@@ -59,7 +59,7 @@ def main(argv: list[str]) -> None:
             for line in tables.differences(old, results):
                 print(f"warning: not the same: {line}", file=sys.stderr)
     if values.json is not None:
-        from jaxil.files.metrics import write_atomically
+        from jaxil.files.writing import write_atomically
 
         try:
             text = json.dumps(results, indent=2) + "\n"

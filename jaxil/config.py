@@ -132,6 +132,17 @@ FIELDS: dict[str, Field] = {
     ),
     "video_every_evals": Field(5, "0 turns videos off", 0, 10**6),
 }
+# Fields that change what is kept or shown, or how fast it comes, and nothing that is
+# learned: runs that differ in no other are seeds of one thing, and may be resumed.
+FREE_FIELDS = (
+    "total_frames",
+    "encoder.convolutions",
+    "replay_on_device",
+    "eval_every_frames",
+    "num_eval_episodes",
+    "checkpoint_every_frames",
+    "video_every_evals",
+)
 # Fields that must end with a decision.
 _WHOLE_DECISIONS = (
     "total_frames",

@@ -1,18 +1,16 @@
-r"""Evaluates the newest checkpoint of a run again: returns, and a video.
+r"""Evaluates the newest checkpoint of a run: returns, and a video.
 
     python -m jaxil.evaluate --workdir=runs/pdac --num_episodes=50
 
-The policy acts by its mean action, on the task's own reward. Nothing of the run is
-changed; the video goes to WORKDIR/videos/evaluation.mp4, the returns to the screen.
+The policy takes its mean action. Nothing of the run is changed: the video is written
+to WORKDIR/videos/evaluation.mp4, the returns to the screen.
 """
 
-import pathlib
 import sys
 
 from absl import flags
 
 from jaxil import command
-from jaxil.errors import UsageError
 
 # Far from the episodes that training evaluates on.
 _FIRST_EPISODE = 1_000_000
@@ -21,20 +19,16 @@ _FIRST_EPISODE = 1_000_000
 def main(argv: list[str]) -> None:
     """Runs the command."""
     values = command.parse(argv, __doc__ or "", _define)
-    if values.workdir is None:
-        raise UsageError(
-            "--workdir is missing: name the folder of a run, such as --workdir=runs/1"
-        )
     from jaxil.machine import startup
+    from jaxil.training import workdir
+
+    folder = workdir.from_flag(values.workdir)
 
     print(startup.prepare(), file=sys.stderr, flush=True)
-    import numpy as np
-
     from jaxil.environments.evaluation import evaluate
     from jaxil.files.video import write_video
     from jaxil.training import run_log, trained
 
-    folder = pathlib.Path(values.workdir)
     run = trained.load(folder)
     evaluation = evaluate(
         run.environment,
@@ -45,11 +39,11 @@ def main(argv: list[str]) -> None:
     )
     for number, task_return in enumerate(evaluation.task_returns):
         print(f"episode {number}: {task_return:.1f}")
+    returns = evaluation.task_returns
     line = (
         f"{run.config.method} on {run.config.task}, frame {run.frame}: mean "
-        f"{evaluation.mean:.1f}, std {evaluation.std:.1f}, minimum "
-        f"{np.min(evaluation.task_returns):.1f}, maximum "
-        f"{np.max(evaluation.task_returns):.1f}"
+        f"{evaluation.mean:.1f}, std {evaluation.std:.1f}, minimum {returns.min():.1f},"
+        f" maximum {returns.max():.1f}"
     )
     expert_frames = None
     if run.demonstrations is not None:

@@ -4,11 +4,8 @@ r"""Trains one agent: imitation from video, or DrQ-v2 on the true reward.
     python -m jaxil.launch --config=configs/psil.py:cheetah_run --workdir=runs/psil \
         --config.seed=3
 
-The same command again goes on where the run stopped.
+Rerun the same command to resume.
 """
-
-import pathlib
-import sys
 
 from absl import flags
 
@@ -19,28 +16,25 @@ from jaxil.errors import UsageError
 def main(argv: list[str]) -> int:
     """Runs the command; returns its exit status."""
     values = command.parse(argv, __doc__ or "", _define)
-    if values.workdir is None:
-        raise UsageError(
-            "--workdir is missing: name a folder for the run, such as --workdir=runs/1"
-        )
-    # Before jax and MuJoCo are imported, which the imports below do.
-    from jaxil.machine import startup
+    from jaxil.machine import screen, startup
+    from jaxil.training import workdir
 
-    print(startup.prepare(), file=sys.stderr, flush=True)
+    folder = workdir.from_flag(values.workdir)
+    # Before jax and MuJoCo are imported, which the imports below do.
+    screen.say(startup.prepare())
 
     from jaxil import doctor, train
     from jaxil.environments.pool import EnvironmentsFailed
     from jaxil.machine import provenance
     from jaxil.training import agent as agents
-    from jaxil.training import assembly, workdir
+    from jaxil.training import assembly
 
     config = values.config
-    folder = pathlib.Path(values.workdir)
-    faults = assembly.problems(config) + workdir.problems(folder, config)
+    faults = [*assembly.problems(config), *workdir.problems(folder, config)]
     if faults:
         raise UsageError(faults)
     for finding in doctor.memory(config):
-        print(finding, file=sys.stderr, flush=True)
+        screen.say(str(finding))
     with workdir.opened(folder):
         try:
             gl_name = assembly.renderer_name(config)
@@ -48,8 +42,12 @@ def main(argv: list[str]) -> int:
             description = provenance.describe(gl_name, native=native)
             workdir.write_config(folder, config, description)
             finished = train.train(config, folder)
-        except (train.TrainingDiverged, EnvironmentsFailed) as error:
-            print(f"training stopped: {error}", file=sys.stderr)
+        except (
+            train.TrainingDiverged,
+            EnvironmentsFailed,
+            workdir.RunFolderError,
+        ) as error:
+            screen.say(f"training stopped: {error}")
             return 1
     return 0 if finished else 130
 

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import pathlib
-import sys
 import time
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from jaxil import methods
 from jaxil.config import Config
 from jaxil.environments.pool import EnvironmentsFailed
+from jaxil.machine import screen
 from jaxil.machine.signals import StopOnSignals
 from jaxil.maths.types import Episode
 from jaxil.training import assembly
@@ -339,13 +339,10 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
       EnvironmentsFailed: there are several, and they cannot go on.
     """
 
-    def say(text: str) -> None:
-        print(text, file=sys.stderr, flush=True)
-
     demonstrations = assembly.load_demonstrations(config)
     method = methods.get(config.method)
-    say(f"{config.task}: {method.label}, {method.about}; seed {config.seed}")
-    run = Run(**make_parts(config, workdir, demonstrations, say))
+    screen.say(f"{config.task}: {method.label}, {method.about}; seed {config.seed}")
+    run = Run(**make_parts(config, workdir, demonstrations, screen.say))
     with contextlib.closing(run), StopOnSignals(run.ask_to_stop):
         try:
             run.loop()
@@ -356,5 +353,7 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
             ) from error
         run.finish()
     if run.stop_asked:
-        say(f"stopped at frame {run.frame}, saved; rerun the same command to resume")
+        screen.say(
+            f"stopped at frame {run.frame}, saved; rerun the same command to resume"
+        )
     return not run.stop_asked

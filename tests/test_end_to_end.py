@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from jaxil.files.metrics import read_csv
+from jaxil.files.tables import read_csv
 from tests.commands import ROOT, arguments, run, small_run
 
 _CLOCKS = ("seconds", "frames_per_second", "reward_seconds")
@@ -171,6 +171,23 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path):
     assert "the same command goes on from there" in stderr
     assert "Traceback" not in stderr
     assert list((tmp_path / "checkpoints").glob("frame_*"))
+
+
+def test_a_run_outlives_the_pipe_that_it_writes_to(tmp_path):
+    # As in `... 2>&1 | head -1`.
+    process = subprocess.Popen(
+        arguments("launch", *small_run("zero", tmp_path), "--config.total_frames=2000"),
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+    )
+    assert process.stdout is not None
+    process.stdout.readline()
+    process.stdout.close()
+    assert process.wait(timeout=200) == 0
+    np.testing.assert_array_equal(read_csv(tmp_path / "eval.csv")["frame"], [2000])
+    assert list((tmp_path / "checkpoints").glob("frame_000000002000"))
 
 
 def _wait_for(condition, process, seconds: float = 200.0) -> None:

@@ -13,7 +13,7 @@ import time
 import numpy as np
 import pytest
 
-from jaxil.files.metrics import read_csv
+from jaxil.files.tables import read_csv
 from launch.sweeps import slurm, state
 from launch.sweeps.state import State
 from tests.commands import ROOT, SMALL

@@ -12,7 +12,7 @@ import types
 import pytest
 
 from jaxil import train
-from jaxil.files.metrics import read_csv
+from jaxil.files.tables import read_csv
 from launch.sweeps import clusters, cost, plan, state, tables
 from launch.sweeps.clusters import Cluster
 from launch.sweeps.faults import Faulty
@@ -131,7 +131,7 @@ def test_every_fault_of_every_run_is_told_once(tmp_path):
         "--methods='gail' is unknown",
         "--ablation='figure1' is unknown",
         "--seeds=0 must be at least 1",
-        "can't be written",
+        "not writable",
         "--config.seed=3 is what the sweep itself sets: use --seeds",
         "field='batchsize' is unknown; did you mean: batch_size",
     )

@@ -94,7 +94,7 @@ def test_a_second_config_in_the_same_folder_is_refused(tmp_path):
         (["--config=nowhere.py", "--workdir=x"], "there is no file 'nowhere.py'"),
         (["--config=configs/tiny.py:pdac", "--workdir=x"], "METHOD,TASK"),
         (["--config=configs/pdac.py"], "--workdir is missing"),
-        (["--config=configs/pdac.py", "--workdir=/proc/x"], "can't be written"),
+        (["--config=configs/pdac.py", "--workdir=/proc/x"], "not writable"),
         (["--config=setup.cfg", "--workdir=x"], "--config"),
         (["--config=configs/pdac.py", "--workdir=x", "stray"], "'stray'"),
     ],

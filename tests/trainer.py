@@ -12,7 +12,7 @@ import sys
 import time
 
 from jaxil.command import UsageError
-from jaxil.files.metrics import CsvLog
+from jaxil.files.tables import CsvLog
 from jaxil.machine.signals import StopOnSignals
 from jaxil.training import workdir
 from launch.sweeps.plan import Run

@@ -1,20 +1,18 @@
 """The one live line of whatever takes long: how far, how fast, how long still."""
 
-import sys
 import time
 from collections.abc import Callable, Mapping
 from typing import TextIO
 
-_TTY_SECONDS = 0.2  # between two redraws in a terminal
+from jaxil.machine.screen import LastingStream
+
+_TTY_SECONDS = 0.2  # between two updates of a terminal's line, and of the speed
 _PLAIN_SECONDS = 30.0  # between two lines in a log file
+_WINDOW_SECONDS = 60.0  # that the speed is measured over
 
 
 class ProgressLine:
-    """Writes one line on stderr: redrawn in a terminal, else a new one now and then.
-
-    Frames per second and the split are those of the last half to whole window, so they
-    follow a run that changes speed.
-    """
+    """Shows one line on stderr: live in a terminal, else a new one now and then."""
 
     def __init__(
         self,
@@ -24,7 +22,6 @@ class ProgressLine:
         label: str = "",
         unit: str = "frames",
         stream: TextIO | None = None,
-        window_seconds: float = 60.0,
         clock: Callable[[], float] = time.monotonic,
     ):
         """Starts the clock.
@@ -35,101 +32,102 @@ class ProgressLine:
           label: a few words for the line's beginning.
           unit: what is counted, if not environment frames.
           stream: where to write; stderr when None.
-          window_seconds: longest time that speed and split are taken over.
           clock: seconds from any origin, for tests.
         """
-        self._total_frames = total_frames
+        # Imported here: commands that only write time spans need none of it.
+        from rich import console, progress
+
+        self._stream = LastingStream(stream)
+        screen = console.Console(
+            file=self._stream,  # pyright: ignore[reportArgumentType]
+            force_terminal=self._stream.isatty(),
+            highlight=False,
+        )
+        self._live = screen.is_terminal and not screen.is_dumb_terminal
+        # rich measures the speed, also where nothing is shown by it.
+        self._progress = progress.Progress(
+            progress.TextColumn("{task.description}", markup=False),
+            console=screen,
+            auto_refresh=False,
+            redirect_stdout=False,
+            redirect_stderr=False,
+            speed_estimate_period=_WINDOW_SECONDS,
+            get_time=clock,
+        )
         self._label = f"{label}: " if label else ""
         self._unit = unit
-        self._stream = sys.stderr if stream is None else stream
-        self._live = self._stream.isatty()
         self._clock = clock
-        self._window_seconds = window_seconds
-        now = clock()
-        # Two marks half a window apart: speed is measured from the older one.
-        self._marks = [(now, first_frame, {})] * 2
-        self._next_write = now if self._live else now + _PLAIN_SECONDS / 10
-        self._width = 0
+        self._began = clock()
+        self._next_update = self._began
+        self._next_line = self._began + _PLAIN_SECONDS / 10
+        self._task = self._progress.add_task("", total=total_frames)
+        # The first sample only says where and when the others begin.
+        self._progress.update(self._task, completed=max(first_frame, 1e-9))
 
     def update(
         self,
         frame: int,
         seconds: Mapping[str, float],
         returns: Mapping[str, float] | None = None,
-        note: str = "",
     ) -> None:
         """Says where the run stands; cheap to call at every step.
 
         Args:
           frame: environment frames so far.
-          seconds: total seconds so far by name, e.g. environment, update; what they
-            leave of the wall clock is shown as the rest.
+          seconds: this process's seconds so far by name, e.g. environment, update; the
+            remainder of its time is shown as the rest.
           returns: last returns by name, e.g. task, imitation, evaluation.
-          note: a few words for the line's end.
         """
         now = self._clock()
-        if now < self._next_write:
+        if now < self._next_update:
             return
-        self._next_write = now + (_TTY_SECONDS if self._live else _PLAIN_SECONDS)
-        line = self._line(now, frame, seconds, returns or {}, note)
-        if now - self._marks[1][0] >= self._window_seconds / 2:
-            self._marks = [self._marks[1], (now, frame, dict(seconds))]
+        self._next_update = now + _TTY_SECONDS
+        self._progress.update(self._task, completed=frame)
         if self._live:
-            self._stream.write("\r" + line.ljust(self._width))
-            self._width = len(line)
-        else:
-            self._stream.write(line + "\n")
-        self._stream.flush()
+            self._start()
+            line = self._line(now, seconds, returns or {})
+            self._progress.update(self._task, description=line, refresh=True)
+        elif now >= self._next_line:
+            self._next_line = now + _PLAIN_SECONDS
+            self.message(self._line(now, seconds, returns or {}))
 
     def message(self, text: str) -> None:
-        """Writes a lasting line of its own above the live one."""
+        """Writes a lasting line, above the live one."""
         if self._live:
-            self._stream.write("\r" + text.ljust(self._width) + "\n")
-            self._width = 0
+            self._progress.console.print(text, markup=False, soft_wrap=True)
         else:
-            self._stream.write(text + "\n")
-        self._stream.flush()
+            self._stream.write(f"{text}\n")
 
     def close(self) -> None:
-        """Leaves the last live line standing."""
-        if self._live and self._width:
-            self._stream.write("\n")
-            self._stream.flush()
-            self._width = 0
+        """Leaves the live line as it is, and goes to the next."""
+        self._progress.stop()
+
+    def _start(self) -> None:
+        if not self._progress.live.is_started:
+            self._progress.start()
+            # A run that is killed could not bring it back.
+            self._progress.console.show_cursor(True)
 
     def _line(
-        self,
-        now: float,
-        frame: int,
-        seconds: Mapping[str, float],
-        returns: Mapping[str, float],
-        note: str,
+        self, now: float, seconds: Mapping[str, float], returns: Mapping[str, float]
     ) -> str:
-        since, first_frame, before = self._marks[0]
-        elapsed = max(now - since, 1e-9)
-        speed = (frame - first_frame) / elapsed
-        percent = 100 * frame / self._total_frames
+        task = self._progress.tasks[0]
+        speed = task.speed or 0.0
         parts = [
-            f"{self._label}{frame}/{self._total_frames} {self._unit} ({percent:.1f} %)",
+            f"{self._label}{task.completed:.0f}/{task.total:.0f} {self._unit} "
+            f"({task.percentage:.1f} %)",
             f"{speed:.{0 if speed >= 10 else 1}f} {self._unit}/s",
         ]
         if seconds:
-            shares = {
-                name: (total - before.get(name, 0.0)) / elapsed
-                for name, total in seconds.items()
-            }
+            elapsed = max(now - self._began, 1e-9)
+            shares = {name: total / elapsed for name, total in seconds.items()}
             shares["rest"] = max(1.0 - sum(shares.values()), 0.0)
-            parts.append(
-                " ".join(f"{name} {100 * share:.0f}%" for name, share in shares.items())
-            )
+            parts.append(" ".join(f"{k} {100 * v:.0f}%" for k, v in shares.items()))
         if returns:
             shown = " ".join(f"{name} {value:.1f}" for name, value in returns.items())
             parts.append(f"return {shown}")
-        left = self._total_frames - frame
-        if speed > 0 and left > 0:
-            parts.append(f"{duration(left / speed)} left")
-        if note:
-            parts.append(note)
+        if speed > 0 and not task.finished:
+            parts.append(f"{duration((task.remaining or 0.0) / speed)} left")
         return " | ".join(parts)
 
 

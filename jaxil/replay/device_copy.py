@@ -15,7 +15,7 @@ from jaxil.replay.replay import Replay
 _BLOCK_FRAMES = 64
 
 
-class Mirror:
+class DeviceCopy:
     """Holds the frames of a replay's ring in one array on jax's default device.
 
     Attributes:
@@ -28,7 +28,7 @@ class Mirror:
 
         Args:
           replay: not to be cleared from now on.
-          block_frames: frames that are sent in one go, >= 1.
+          block_frames: frames that are sent at a time, >= 1.
         """
         self._replay = replay
         self._block_frames = min(block_frames, len(replay.frames))
@@ -37,17 +37,18 @@ class Mirror:
         self.refresh()
 
     def refresh(self) -> None:
-        """Copies the episodes that were added since the last time."""
+        """Copies the episodes that were added since the last call."""
         ring, size = self._replay.frames, self._block_frames
-        added = self._replay.num_episodes_added
-        for index in range(max(self._replay.oldest_episode, self._num_episodes), added):
+        for index in self._replay.episodes:
+            if index < self._num_episodes:
+                continue
             # Whole blocks of the ring: their other frames are sent as they were.
             for block in np.unique(self._replay.slots(index) // size):
                 first = min(block * size, len(ring) - size)
                 # A copy, because jax may go on reading after the ring has changed.
                 frames = np.array(ring[first : first + size])
                 self.frames = _write(self.frames, frames, np.int32(first))
-        self._num_episodes = added
+        self._num_episodes = self._replay.num_episodes_added
 
 
 # The array is donated: it is written to in place, not copied whole.

@@ -31,27 +31,25 @@ def checked_episode(frames, actions, rewards, discounts, *, like: Episode) -> Ep
       ValueError: for a wrong shape or dtype, or a number that is out of range.
     """
     frames = np.asarray(frames)
-    require(frames.ndim > 0, "frames.shape", frames.shape, "[T + 1, ...]")
-    require(len(frames) > 1, "frames.shape", frames.shape, "at least two frames")
-    arrays = []
-    for name, array, ring in (
-        ("frames", frames, like.frames),
-        ("actions", np.asarray(actions), like.actions),
-        ("rewards", np.asarray(rewards), like.rewards),
-        ("discounts", np.asarray(discounts), like.discounts),
-    ):
-        expected = (len(frames) - (name != "frames"), *ring.shape[1:])
-        if name == "frames":
-            require(array.shape == expected, "frames.shape", array.shape, expected)
-            same = array.dtype == ring.dtype
-            require(same, "frames.dtype", array.dtype, ring.dtype)
-            _require_all(np.isfinite(array), name, array, "finite")
-        else:
-            array = checked_values(name, array, np.empty(expected, ring.dtype))
-        if name == "discounts":
-            _require_all((array >= 0) & (array <= 1), name, array, "in [0, 1]")
-        arrays.append(array)
-    return Episode(*arrays)
+    shape, dtype = frames.shape, frames.dtype
+    num_frames = len(frames) if frames.ndim > 0 else 0
+    require(num_frames > 1, "frames.shape", shape, "at least two frames")
+    expected = (num_frames, *like.frames.shape[1:])
+    require(shape == expected, "frames.shape", shape, expected)
+    require(dtype == like.frames.dtype, "frames.dtype", dtype, like.frames.dtype)
+    _require_all(np.isfinite(frames), "frames", frames, "finite")
+
+    def checked(name: str, values) -> np.ndarray:
+        ring = getattr(like, name)
+        shape = (num_frames - 1, *ring.shape[1:])
+        return checked_values(name, values, np.empty(shape, ring.dtype))
+
+    discounts = checked("discounts", discounts)
+    in_range = (discounts >= 0) & (discounts <= 1)
+    _require_all(in_range, "discounts", discounts, "in [0, 1]")
+    return Episode(
+        frames, checked("actions", actions), checked("rewards", rewards), discounts
+    )
 
 
 def checked_values(name: str, values, like: np.ndarray) -> np.ndarray:
@@ -75,13 +73,13 @@ def checked_values(name: str, values, like: np.ndarray) -> np.ndarray:
     return values
 
 
-def _require_all(good: np.ndarray, name: str, values: np.ndarray, rule: str) -> None:
-    if not good.all():
-        first = tuple(np.argwhere(~good)[0].tolist())
-        require(False, f"{name}{list(first)}", values[first], rule)
-
-
 def require(condition: bool, name: str, value: object, rule: object) -> None:
     """Raises a ValueError that says which rule a value breaks, unless it holds."""
     if not condition:
         raise ValueError(f"{name} = {value}: expected {rule}")
+
+
+def _require_all(good: np.ndarray, name: str, values: np.ndarray, rule: str) -> None:
+    if not good.all():
+        first = tuple(np.argwhere(~good)[0].tolist())
+        require(False, f"{name}{list(first)}", values[first], rule)

@@ -1,8 +1,7 @@
-"""The replay: a NumPy ring of single frames, from which n-step windows are drawn.
+"""The replay: a NumPy ring of single frames, from which n-step windows are sampled.
 
 Each frame is stored once and stacks are made when they are sampled, so that the paper's
-150000 steps of 84x84 pixels take 3.2 GB (stored stacks would take 9.5 GB). Whole
-episodes enter, and the oldest whole episodes leave.
+150000 steps of 84x84 pixels take 3.2 GB (stored stacks would take 9.5 GB).
 
 Axes: B batch, T steps of an episode, n the length of a window, H W C pixels.
 """
@@ -17,30 +16,15 @@ from jaxil.replay.ring import EpisodeRing, ring_slots
 from jaxil.replay.stacking import gather_stacks
 
 
-def memory_bytes(
-    *,
-    capacity_steps: int,
-    episode_steps: int,
-    observation_shape: tuple[int, ...],
-    observation_dtype,
-    action_dim: int,
-) -> int:
-    """Says how much memory a full replay of these sizes takes, in bytes.
+def memory_bytes(*, action_dim: int, **sizes) -> int:
+    """Returns how much memory a full replay takes, in bytes.
 
     Args:
-      capacity_steps: transitions kept at most.
-      episode_steps: transitions of a usual episode; it has one frame more than that.
-      observation_shape: shape of a single frame, (H, W, C), or of a state, (S,).
-      observation_dtype: dtype of a frame.
       action_dim: A.
+      **sizes: see `frames_bytes`.
     """
-    frames = frames_bytes(
-        capacity_steps=capacity_steps,
-        episode_steps=episode_steps,
-        observation_shape=observation_shape,
-        observation_dtype=observation_dtype,
-    )
-    return frames + ring_slots(capacity_steps, episode_steps) * 4 * (action_dim + 2)
+    slots = ring_slots(sizes["capacity_steps"], sizes["episode_steps"])
+    return frames_bytes(**sizes) + slots * 4 * (action_dim + 2)
 
 
 def frames_bytes(
@@ -50,60 +34,48 @@ def frames_bytes(
     observation_shape: tuple[int, ...],
     observation_dtype,
 ) -> int:
-    """Says how much of `memory_bytes` is frames, of which a device may hold a copy."""
+    """Returns how much of it is frames, of which a device may hold a copy.
+
+    Args:
+      capacity_steps: transitions kept at most.
+      episode_steps: transitions of a usual episode.
+      observation_shape: shape of a single frame, (H, W, C), or of a state, (S,).
+      observation_dtype: dtype of a frame.
+    """
     frame_bytes = math.prod(observation_shape) * np.dtype(observation_dtype).itemsize
     return ring_slots(capacity_steps, episode_steps) * frame_bytes
 
 
 class Replay(EpisodeRing):
-    """Stores the newest episodes and draws n-step transitions from them, uniformly."""
+    """Stores the newest episodes and samples n-step transitions from them."""
 
     def __init__(
-        self,
-        *,
-        capacity_steps: int,
-        episode_steps: int,
-        observation_shape: tuple[int, ...],
-        observation_dtype,
-        action_dim: int,
-        frame_stack: int,
-        num_steps: int,
-        discount_factor: float,
+        self, *, frame_stack: int, num_steps: int, discount_factor: float, **sizes
     ):
-        """Reserves the memory; the system hands it out as it is written to.
+        """Reserves the memory.
 
         Args:
-          capacity_steps: transitions kept at most, >= episode_steps.
-          episode_steps: transitions of a usual episode (see `memory_bytes`), >= 1.
-          observation_shape: shape of a single frame, (H, W, C), or of a state, (S,).
-          observation_dtype: uint8 for pixels, float32 for states.
-          action_dim: A >= 1.
           frame_stack: frames in an observation, >= 1; 1 for states.
           num_steps: n >= 1, the steps that a sampled transition spans.
           discount_factor: gamma in [0, 1].
+          **sizes: see `EpisodeRing`.
 
         Raises:
           ValueError: if a number breaks its rule.
         """
+        super().__init__(**sizes)
         require(frame_stack >= 1, "frame_stack", frame_stack, ">= 1")
         require(num_steps >= 1, "num_steps", num_steps, ">= 1")
         in_range = 0 <= discount_factor <= 1
         require(in_range, "discount_factor", discount_factor, "in [0, 1]")
-        stackable = len(observation_shape) != 1 or frame_stack == 1
+        stackable = self._frames.ndim != 2 or frame_stack == 1
         require(stackable, "frame_stack", frame_stack, "1 for states")
-        super().__init__(
-            capacity_steps=capacity_steps,
-            episode_steps=episode_steps,
-            observation_shape=observation_shape,
-            observation_dtype=observation_dtype,
-            action_dim=action_dim,
-        )
         self._frame_stack = frame_stack
         self._window = num_steps
         self._discount_factor = discount_factor
 
     def can_sample(self) -> bool:
-        """Says whether any stored episode is long enough for a window of n steps."""
+        """Returns whether any stored episode has a window of n steps."""
         return bool(self._num_windows().any())
 
     def sample(
@@ -114,7 +86,7 @@ class Replay(EpisodeRing):
         windows: bool = False,
         successors: bool = False,
     ) -> Batch:
-        """Draws transitions, uniformly with replacement from all windows of n steps.
+        """Samples transitions, uniformly with replacement from all windows of n steps.
 
         reward = sum_{k<n} gamma^k d_t ... d_{t+k-1} r_{t+k}, and
         discount = gamma^n d_t ... d_{t+n-1}, with d the environment's discounts.
@@ -122,9 +94,9 @@ class Replay(EpisodeRing):
         start.
 
         Args:
-          rng: source of the draw; it is advanced by one call.
+          rng: it is advanced by one call.
           batch_size: B >= 1.
-          windows: whether to add each window's own transitions.
+          windows: whether to add all of each window's transitions.
           successors: whether to add o_{t+1}.
 
         Returns:
@@ -133,26 +105,26 @@ class Replay(EpisodeRing):
         Raises:
           ValueError: if no stored episode is as long as a window.
         """
-        found = self.sample_indices(
+        batch = self.sample_indices(
             rng, batch_size, windows=windows, successors=successors
         )
-        # All stacks in one go: the work is shared out among threads.
-        parts = [found.observation[None], found.next_observation[None]]
-        if found.successor is not None:
-            parts.append(found.successor[None])
-        if found.window is not None:
-            parts.append(found.window.observation.swapaxes(0, 1))
+        # All stacks in one call, which shares the work out among threads.
+        parts = [batch.observation[None], batch.next_observation[None]]
+        if batch.successor is not None:
+            parts.append(batch.successor[None])
+        if batch.window is not None:
+            parts.append(batch.window.observation.swapaxes(0, 1))
         slots = np.concatenate(parts)
         stacks = gather_stacks(self._frames, slots.reshape(-1, self._frame_stack))
         stacks = stacks.reshape(*slots.shape[:2], *stacks.shape[1:])
-        window = found.window
+        window = batch.window
         if window is not None:
             inside = stacks[-self._window :].swapaxes(0, 1)
             window = window._replace(observation=np.ascontiguousarray(inside))
-        return found._replace(
+        return batch._replace(
             observation=stacks[0],
             next_observation=stacks[1],
-            successor=None if found.successor is None else stacks[2],
+            successor=None if batch.successor is None else stacks[2],
             window=window,
         )
 
@@ -164,17 +136,11 @@ class Replay(EpisodeRing):
         windows: bool = False,
         successors: bool = False,
     ) -> Batch:
-        """Draws what `sample` draws, with the places of frames instead of pixels.
-
-        Args:
-          rng: see `sample`; the same one gives the same transitions.
-          batch_size: B >= 1.
-          windows: see `sample`.
-          successors: see `sample`.
+        """Samples what `sample` does, with indices of frames in place of pixels.
 
         Returns:
           A batch in which each stack [H, W, C * stack] is the int32 [stack] of its
-          frames' slots in `frames`, the oldest first. They hold until the next
+          frames' indices in `frames`, the oldest first. They are valid until the next
           episode is added.
 
         Raises:
@@ -186,7 +152,7 @@ class Replay(EpisodeRing):
                 f"num_steps_stored = {self._num_steps_stored}: expected an episode of"
                 f" at least {self._window} steps; add one before sampling"
             )
-        # Laid end to end, so that one draw picks an episode and a time t in it.
+        # Laid end to end, so that one number picks an episode and a time t in it.
         ends = np.cumsum(num_windows)
         flat = rng.integers(int(ends[-1]), size=batch_size)
         which = np.searchsorted(ends, flat, side="right")
@@ -224,10 +190,9 @@ class Replay(EpisodeRing):
         return np.maximum(self._lengths - self._window + 1, 0)
 
     def _stack_slots(self, starts: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        """Says where the frames of o_t lie, of episodes that begin in slots `starts`.
+        """Returns the slots of each o_t's frames, for episodes that begin at `starts`.
 
-        Returns:
-          int32, a last axis of frames added, the oldest first.
+        They are int32, along a new last axis, the oldest first.
         """
         ages = np.arange(self._frame_stack)[::-1]
         slots = starts[..., None] + np.maximum(steps[..., None] - ages, 0)

@@ -5,7 +5,6 @@ Each frame is stored once. Whole episodes enter, and the oldest whole episodes l
 Axes: T steps of an episode, H W C pixels.
 """
 
-import collections
 import math
 from typing import NamedTuple
 
@@ -20,7 +19,7 @@ class _Stored(NamedTuple):
 
 
 class EpisodeRing:
-    """Stores the newest episodes.
+    """Stores the newest episodes, numbered in the order in which they were added.
 
     The next free slot follows the newest frame, modulo the ring's length; an episode
     may run over the ring's end. A slot holds o_t with the a_t, r_t and d_t that follow.
@@ -35,7 +34,7 @@ class EpisodeRing:
         observation_dtype,
         action_dim: int,
     ):
-        """Reserves the memory; the system hands it out as it is written to.
+        """Reserves the memory, which the system hands out as it is written to.
 
         Args:
           capacity_steps: transitions kept at most, >= episode_steps.
@@ -66,10 +65,9 @@ class EpisodeRing:
 
     def clear(self, first_episode: int = 0) -> None:
         """Forgets all episodes; the next one added gets the number `first_episode`."""
-        self._stored: collections.deque[_Stored] = collections.deque()
+        self._stored: dict[int, _Stored] = {}  # by number, the oldest first
         self._num_episodes_added = first_episode
         self._num_steps_stored = 0
-        self._num_frames_stored = 0
         self._next_slot = 0
         self._index_episodes()
 
@@ -86,19 +84,23 @@ class EpisodeRing:
         return self._num_steps_stored
 
     @property
-    def num_episodes_stored(self) -> int:
-        """Episodes in the replay now."""
-        return len(self._stored)
+    def episodes(self) -> list[int]:
+        """Numbers of the stored episodes, rising; some may be missing in between."""
+        return list(self._stored)
 
     @property
     def num_episodes_added(self) -> int:
-        """Episodes ever added; the newest one has the number below this."""
+        """Episodes ever added, or skipped; the next one gets this number."""
         return self._num_episodes_added
 
     @property
     def oldest_episode(self) -> int:
-        """Number of the oldest episode that is still stored."""
-        return self._num_episodes_added - len(self._stored)
+        """Number of the oldest stored episode; of the next one if there is none."""
+        return next(iter(self._stored), self._num_episodes_added)
+
+    def skip_episode(self) -> None:
+        """Leaves out the next number: its episode has been lost."""
+        self._num_episodes_added += 1
 
     def add_episode(self, *, frames, actions, rewards, discounts) -> None:
         """Copies one whole episode in; the oldest ones make room for it.
@@ -117,8 +119,7 @@ class EpisodeRing:
         frames, actions, rewards, discounts = checked_episode(
             frames, actions, rewards, discounts, like=like
         )
-        num_steps = len(rewards)
-        length = len(self._frames)
+        num_steps, length = len(rewards), len(self._frames)
         fits = num_steps <= self._capacity_steps and num_steps < length
         require(
             fits, "episode length", num_steps, f"at most {self._capacity_steps} steps"
@@ -126,11 +127,10 @@ class EpisodeRing:
 
         while (
             self._num_steps_stored + num_steps > self._capacity_steps
-            or self._num_frames_stored + num_steps + 1 > length
+            # Each episode has one frame more than it has steps.
+            or self._num_steps_stored + len(self._stored) + num_steps + 1 > length
         ):
-            evicted = self._stored.popleft()
-            self._num_steps_stored -= evicted.num_steps
-            self._num_frames_stored -= evicted.num_steps + 1
+            self._num_steps_stored -= self._stored.pop(self.oldest_episode).num_steps
         start = self._next_slot
         # In two pieces where the ring ends: slices copy faster than index lists.
         head = min(num_steps + 1, length - start)
@@ -140,18 +140,17 @@ class EpisodeRing:
         self._actions[slots] = actions
         self._rewards[slots] = rewards
         self._discounts[slots] = discounts
-        self._stored.append(_Stored(start, num_steps))
+        self._stored[self._num_episodes_added] = _Stored(start, num_steps)
         self._next_slot = (start + num_steps + 1) % length
         self._num_steps_stored += num_steps
-        self._num_frames_stored += num_steps + 1
         self._num_episodes_added += 1
         self._index_episodes()
 
     def replace_rewards(self, index: int, rewards) -> None:
-        """Gives one stored episode other rewards.
+        """Replaces the rewards of one stored episode.
 
         Args:
-          index: see `episode`.
+          index: its number.
           rewards: [T] float, finite, for the T steps that the episode has.
 
         Raises:
@@ -163,40 +162,20 @@ class EpisodeRing:
         self._rewards[slots] = checked_values("rewards", rewards, self._rewards[slots])
 
     def rewards(self, index: int) -> np.ndarray:
-        """Copies the rewards of one stored episode out, [T].
-
-        Args:
-          index: see `episode`.
-
-        Raises:
-          IndexError: if it is not stored.
-        """
+        """Returns a copy of the rewards of one stored episode, [T]."""
         return self._rewards[self.slots(index)[:-1]]
 
     def actions(self, index: int) -> np.ndarray:
-        """Copies the actions of one stored episode out, [T, A].
-
-        Args:
-          index: see `episode`.
-
-        Raises:
-          IndexError: if it is not stored.
-        """
+        """Returns a copy of the actions of one stored episode, [T, A]."""
         return self._actions[self.slots(index)[:-1]]
 
     def mean_reward(self) -> float:
         """Returns the mean of all stored rewards; NaN without any."""
-        total = sum(
-            self.rewards(index).sum(dtype=np.float64)
-            for index in range(self.oldest_episode, self.num_episodes_added)
-        )
+        total = sum(self.rewards(i).sum(dtype=np.float64) for i in self._stored)
         return float(total / self._num_steps_stored) if self._stored else math.nan
 
     def episode(self, index: int) -> Episode:
-        """Copies one stored episode out.
-
-        Args:
-          index: its number, `oldest_episode` <= index < `num_episodes_added`.
+        """Returns a copy of one stored episode.
 
         Raises:
           IndexError: if it is not stored.
@@ -210,59 +189,24 @@ class EpisodeRing:
         )
 
     def slots(self, index: int) -> np.ndarray:
-        """Returns where the frames of a stored episode lie in `frames`, [T + 1].
-
-        Args:
-          index: see `episode`.
+        """Returns where in `frames` those of a stored episode are, [T + 1].
 
         Raises:
           IndexError: if it is not stored.
         """
-        if not self.oldest_episode <= index < self._num_episodes_added:
+        if index not in self._stored:
             raise IndexError(
                 f"episode {index} is not stored: the replay holds"
+                f" {len(self._stored)} of the episodes"
                 f" {self.oldest_episode} to {self._num_episodes_added - 1}"
             )
-        start, num_steps = self._stored[index - self.oldest_episode]
+        start, num_steps = self._stored[index]
         return (start + np.arange(num_steps + 1)) % len(self._frames)
 
-    def check_valid(self) -> tuple[bool, str]:
-        """Checks that the books agree with one another.
-
-        Returns:
-          (True, "") or (False, what is wrong).
-        """
-        length = len(self._frames)
-        steps = sum(stored.num_steps for stored in self._stored)
-        frames = steps + len(self._stored)
-        if steps != self._num_steps_stored or steps > self._capacity_steps:
-            return False, (
-                f"{steps} steps stored, counted {self._num_steps_stored},"
-                f" capacity {self._capacity_steps}"
-            )
-        if frames != self._num_frames_stored or frames > length:
-            return False, (
-                f"{frames} frames stored, counted {self._num_frames_stored},"
-                f" {length} slots"
-            )
-        if self.oldest_episode < 0:
-            return False, f"oldest episode is number {self.oldest_episode}"
-        expected = (self._next_slot - frames) % length
-        for number, stored in enumerate(self._stored, start=self.oldest_episode):
-            if stored.num_steps < 1:
-                return False, f"episode {number} has {stored.num_steps} steps"
-            if stored.start != expected:
-                return False, (
-                    f"episode {number} starts in slot {stored.start}:"
-                    f" expected {expected}"
-                )
-            expected = (expected + stored.num_steps + 1) % length
-        return True, ""
-
     def _index_episodes(self) -> None:
-        """Lays the books out as arrays, which a draw can look up."""
-        table = np.array(self._stored, np.int64).reshape(-1, 2)
-        self._starts, self._lengths = table.T  # first slot and steps of each episode
+        """Keeps first slot and steps of each episode as arrays, for sampling."""
+        table = np.array(list(self._stored.values()), np.int64).reshape(-1, 2)
+        self._starts, self._lengths = table.T
 
 
 def ring_slots(capacity_steps: int, episode_steps: int) -> int:

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxil import config as jaxil_config
-from jaxil.files import metrics
+from jaxil.files import tables
+from jaxil.files.settings import as_stored, flat
 from jaxil.reporting import figures
 
 # Large folders of a run in which no other run can be.
@@ -160,17 +161,6 @@ def read(folder: pathlib.Path) -> Run:
     )
 
 
-def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Returns nested settings by their dotted names."""
-    leaves: dict[str, Any] = {}
-    for name, value in tree.items():
-        if isinstance(value, Mapping):
-            leaves.update(flat(value, f"{prefix}{name}."))
-        else:
-            leaves[f"{prefix}{name}"] = value
-    return leaves
-
-
 def paper_settings(run: Run) -> dict[str, Any]:
     """Returns the paper's settings for a run's method and task, by dotted names."""
     return _defaults(run.config["method"], run.task)
@@ -178,9 +168,7 @@ def paper_settings(run: Run) -> dict[str, Any]:
 
 @functools.cache
 def _defaults(method: str, task: str) -> dict[str, Any]:
-    # Through JSON, which turns tuples into lists, as in config.json.
-    config = jaxil_config.default_config(method, task).to_dict()
-    return flat(json.loads(json.dumps(config)))
+    return flat(as_stored(jaxil_config.default_config(method, task).to_dict()))
 
 
 def _read_config(path: pathlib.Path) -> dict[str, Any]:
@@ -241,7 +229,7 @@ def _read_table(
     columns = ["frame", *([needed] if needed else [])]
     empty = {column: np.zeros(0) for column in columns}
     try:
-        table = metrics.read_csv(path)
+        table = tables.read_csv(path)
         missing = [column for column in columns if column not in table]
         if missing:
             raise ValueError(f"{path}: expected a column {missing[0]}")

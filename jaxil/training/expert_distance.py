@@ -1,7 +1,9 @@
 """The paper's second measure: how far an agent's episodes are from the expert's."""
 
 import json
+import math
 import pathlib
+import zlib
 from typing import Any
 
 import flax.linen as nn
@@ -13,14 +15,15 @@ from jax import Array
 from jaxil.config import Config
 from jaxil.demonstrations import loading
 from jaxil.environments.evaluation import evaluate
-from jaxil.files.metrics import write_atomically
-from jaxil.maths import transport
+from jaxil.files.writing import write_atomically
+from jaxil.maths.transport import sinkhorn_divergence
 from jaxil.maths.types import Episode
 from jaxil.networks.discriminator import Embedding
 from jaxil.networks.encoder import PixelEncoder, StateEncoder
 from jaxil.replay.stacking import gather_stacks
 from jaxil.training import assembly
 from jaxil.training.agent import stack_size
+from jaxil.training.workdir import writes_to
 
 # The same for every method and run, so that their distances can be compared.
 _ENCODER_SEED = 0
@@ -28,24 +31,29 @@ _RANDOM_POLICY_SEED = 2_000_029
 _RANDOM_EPISODES = 5
 _EPSILON, _NUM_ITERATIONS = 0.01, 100  # as P-SIL's; see `jaxil/config.py`
 _FEATURE_DIM, _STATE_DIM = 50, 256
-# Moments of an episode that are compared, evenly spaced: 500 of them would take
-# longer than the episodes themselves, and change the ratio by a per cent.
-_MOMENTS = 128
-_MAX_DEMONSTRATIONS = 10
+# Moments of an episode that are compared, evenly spaced, and episodes of one side:
+# the cost matrix is [640, 640] at most.
+_MOMENTS, _MAX_EPISODES = 64, 10
 _LAYERS = ((3, 2), (3, 1), (3, 1), (3, 1))  # kernel and stride, as DrQ-v2's
+# Stored with a random policy's distance: one by another definition is not used.
+_DEFINITION = "debiased Sinkhorn divergence of 64 moments an episode"
 
 
 class Closeness:
     """Measures the distance to the expert, relative to a random policy's.
 
-        mean_{e,k} <C_ek, P_ek>   /   the same of uniformly random actions
+        S(moments of an evaluation, moments of the demonstrations)
+          / S(moments of uniformly random actions, moments of the demonstrations)
 
-    with cosine costs and Sinkhorn plans between the episodes e of an evaluation and
-    the demonstrations k, all seen by one random encoder that is never trained. So 1
-    is a random policy, and 0 is out of reach: starts differ from episode to episode.
+    with S the debiased Sinkhorn divergence between all moments of the episodes of
+    either side, seen by one random encoder that is never trained. So a random policy
+    has 1, and the demonstrations themselves have 0; other episodes of the expert come
+    near 0, as far as their number and their starts allow.
 
-    Source: Cohen et al. 2021, sec. 4.1 and fig. 4. Encoder, entropy and number of
-    moments are not given there.
+    Source: Cohen et al. 2021, sec. 4.1 and fig. 4, which give neither encoder nor
+    entropy nor number of moments. The debiasing is ours: without it, the distance of
+    demonstrations to themselves is far from 0, because features of a random encoder
+    differ by no more than the entropy blurs.
     """
 
     def __init__(
@@ -63,34 +71,31 @@ class Closeness:
         """
         self._config = config
         self._path = workdir / "random_policy.json"
-        frames = demonstrations.frames[:_MAX_DEMONSTRATIONS]
+        frames = demonstrations.frames
         self._embed = make_random_embedding(frames.shape[2:], stack_size(config))
-        self._distance = jax.jit(mean_distance)
-        self._experts = self._embed_all(
-            [
-                whole[:length]
-                for whole, length in zip(
-                    frames, demonstrations.num_frames, strict=False
-                )
-            ]
+        self._expert = self._embed_all(
+            [whole[:n] for whole, n in zip(frames, demonstrations.num_frames)]
         )
 
     def relative_distance(self, episodes: list[Episode]) -> float:
-        """Returns the distance of an evaluation's episodes; a random policy has 1."""
-        return self._mean_distance(episodes) / self._of_random_policy()
+        """Returns the distance of an evaluation's episodes; a random policy has 1.
 
-    def _mean_distance(self, episodes: list[Episode]) -> float:
+        Raises:
+          RunFolderError: the random policy's distance cannot be stored.
+        """
+        return self._distance(episodes) / self._of_random_policy()
+
+    def _distance(self, episodes: list[Episode]) -> float:
         agent = self._embed_all([episode.frames for episode in episodes])
-        return float(self._distance(agent, self._experts))
+        return float(_divergence(agent, self._expert))
 
     def _embed_all(self, episodes: list[np.ndarray]) -> Array:
-        return jnp.stack([self._embed(frames) for frames in episodes])
+        return jnp.concatenate([self._embed(each) for each in episodes[:_MAX_EPISODES]])
 
     def _of_random_policy(self) -> float:
-        try:
-            return float(json.loads(self._path.read_text())["distance"])
-        except FileNotFoundError:
-            pass
+        stored = _read(self._path)
+        if stored is not None:
+            return stored
         environment = assembly.environment_with_seed(self._config, _RANDOM_POLICY_SEED)
         rng = np.random.default_rng(_RANDOM_POLICY_SEED)
         shape = environment.action_spec().shape
@@ -101,16 +106,18 @@ class Closeness:
             first_episode=0,
         )
         environment.close()
-        distance = self._mean_distance(played.episodes)
-        text = json.dumps(
-            {"distance": distance, "task_return_mean": played.mean}, indent=2
-        )
-        write_atomically(self._path, f"{text}\n".encode())
+        # Not zero, which it may be where the expert acts at random too.
+        distance = max(self._distance(played.episodes), 1e-12)
+        content = {"distance": distance, "task_return_mean": played.mean}
+        content |= {"definition": _DEFINITION}
+        content |= {"checksum": _checksum(content)}
+        with writes_to(self._path.parent):
+            write_atomically(self._path, json.dumps(content, indent=2).encode())
         return distance
 
 
 def make_random_embedding(frame_shape: tuple[int, ...], frame_stack: int) -> Any:
-    """Returns frames of an episode, uint8 [T, H, W, 3] -> features [128, D].
+    """Returns frames of an episode, uint8 [T, H, W, 3] -> features [64, D].
 
     Args:
       frame_shape: (H, W, 3), or (S,) for state vectors. Small images get as many
@@ -131,26 +138,11 @@ def make_random_embedding(frame_shape: tuple[int, ...], frame_stack: int) -> Any
     return embed
 
 
-def mean_distance(agent: Array, expert: Array) -> Array:
-    """Returns the mean transport cost over all pairs of episodes.
-
-    Args:
-      agent: features of E episodes. Shape [E, T, D].
-      expert: of K demonstrations. Shape [K, N, D].
-    """
-
-    def distance(mine: Array, theirs: Array) -> Array:
-        cost = transport.cosine_cost(mine, theirs)
-        mass = transport.uniform_mass(jnp.asarray(len(theirs)), len(theirs))
-        plan = transport.sinkhorn_plan(
-            cost, mass, epsilon=_EPSILON, num_iterations=_NUM_ITERATIONS
-        )
-        return jnp.sum(cost * plan)
-
-    def to_all(mine: Array) -> Array:
-        return jax.vmap(lambda theirs: distance(mine, theirs))(expert)
-
-    return jnp.mean(jax.lax.map(to_all, agent))
+@jax.jit
+def _divergence(agent: Array, expert: Array) -> Array:
+    return sinkhorn_divergence(
+        agent, expert, epsilon=_EPSILON, num_iterations=_NUM_ITERATIONS
+    )
 
 
 def _random_encoder(frame_shape: tuple[int, ...]) -> nn.Module:
@@ -164,3 +156,20 @@ def _random_encoder(frame_shape: tuple[int, ...]) -> nn.Module:
         layers.append((kernel, stride))
     kernels, strides = zip(*layers, strict=True)
     return PixelEncoder((32,) * len(layers), kernels, strides)
+
+
+def _read(path: pathlib.Path) -> float | None:
+    """Returns a stored distance; None if it has to be computed again."""
+    try:
+        content = json.loads(path.read_text())
+        intact = content.pop("checksum") == _checksum(content)
+        distance = float(content["distance"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None
+    current = content.get("definition") == _DEFINITION
+    valid = math.isfinite(distance) and distance > 0.0
+    return distance if intact and current and valid else None
+
+
+def _checksum(content: dict[str, Any]) -> int:
+    return zlib.crc32(json.dumps(content, sort_keys=True).encode())

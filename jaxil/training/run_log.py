@@ -2,6 +2,8 @@
 
 import io
 import pathlib
+import time
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,10 +12,23 @@ from jaxil import methods
 from jaxil.config import Config
 from jaxil.demonstrations import loading
 from jaxil.environments.evaluation import Evaluation
-from jaxil.files import metrics, video
+from jaxil.files import video
+from jaxil.files.tables import CsvLog
+from jaxil.files.writing import write_atomically
+from jaxil.machine.screen import say
+from jaxil.training import learning_curve
+from jaxil.training.workdir import writes_to
 
-# The learner's diagnostics in train.csv; the method's own follow.
-LEARNER_COLUMNS = (
+TRAIN_COLUMNS = (
+    "frame",  # environment frames when the episode ended
+    "seconds",  # of the run, earlier processes included
+    "episode",
+    "task_return",  # undiscounted sum of the true rewards, which the agent never sees
+    "imitation_return",  # the same of the rewards that it learns from
+    "length",  # agent steps
+    "frames_per_second",
+    "reward_seconds",
+    # Diagnostics of the learner; those of the method follow.
     "critic/loss",
     "critic/value",
     "critic/target",
@@ -23,12 +38,25 @@ LEARNER_COLUMNS = (
     "actor/pre_tanh",
     "exploration_std",
 )
+EVAL_COLUMNS = (
+    "frame",
+    "seconds",
+    "episode",  # training episodes so far
+    "task_return_mean",
+    "task_return_std",
+    "expert_task_return_mean",
+    "wasserstein_to_expert",  # relative to a random policy's
+    "actor_pre_tanh",
+)
 # Beyond this mean |pre-tanh|, the gradient of tanh is below 1 %.
 _SATURATED = 3.0
 
 
 class Outputs:
-    """Owns what a run writes beside its checkpoints."""
+    """Owns what a run writes beside its checkpoints.
+
+    All methods raise RunFolderError if a file cannot be written.
+    """
 
     def __init__(
         self,
@@ -40,16 +68,16 @@ class Outputs:
         """Opens the tables; on a resume, rows after `resume_frame` are dropped."""
         self._workdir = workdir
         self._config = config
-        self._metrics = metrics.Metrics(
-            workdir,
-            resume_frame=resume_frame,
-            extra_train_columns=(
-                "reward_seconds",
-                *LEARNER_COLUMNS,
-                *methods.get(config.method).metrics,
-            ),
-            extra_eval_columns=("actor_pre_tanh",),
-        )
+        own = methods.get(config.method).metrics
+        with writes_to(workdir):
+            self._train, self._evaluations = (
+                CsvLog(workdir / name, columns, resume_frame=resume_frame, say=say)
+                for name, columns in (
+                    ("train.csv", (*TRAIN_COLUMNS, *own)),
+                    ("eval.csv", EVAL_COLUMNS),
+                )
+            )
+            self._events = _Events(workdir / "tensorboard", resume_frame)
         self._expert_frames: np.ndarray | None = None
         self._expert_return: float | None = None
         if demonstrations is not None:
@@ -57,7 +85,7 @@ class Outputs:
             if demonstrations.frames.ndim == 5:
                 self._expert_frames = demonstrations.frames[0]
         self._pre_tanh = float("nan")
-        self._last: tuple[int, float] | None = None
+        self._last = (0, 0.0)  # frame and seconds of the last row
 
     def episode(
         self,
@@ -72,30 +100,26 @@ class Outputs:
         metrics: dict[str, float],
     ) -> None:
         """Writes one training episode down."""
-        last_frame, last_seconds = self._last or (0, 0.0)
+        last_frame, last_seconds = self._last
         speed = (frame - last_frame) / max(seconds - last_seconds, 1e-9)
         self._last = (frame, seconds)
-        self._pre_tanh = metrics.get("actor/pre_tanh", self._pre_tanh)
-        self._metrics.train(
+        self._write_training(
+            frame,
+            seconds,
+            episode,
             {
-                "frame": frame,
-                "seconds": round(seconds, 3),
-                "episode": episode,
                 "task_return": task_return,
                 "imitation_return": imitation_return,
                 "length": length,
                 "frames_per_second": round(speed, 2),
                 "reward_seconds": round(reward_seconds, 3),
                 **metrics,
-            }
+            },
         )
 
     def updates(self, *, frame: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Writes a method's progress down that plays no episodes."""
-        self._pre_tanh = metrics.get("actor/pre_tanh", self._pre_tanh)
-        self._metrics.train(
-            {"frame": frame, "seconds": round(seconds, 3), "episode": 0, **metrics}
-        )
+        """Writes down the progress of a method that plays no episodes."""
+        self._write_training(frame, seconds, 0, metrics)
 
     def evaluation(
         self,
@@ -132,16 +156,18 @@ class Outputs:
             row["expert_task_return_mean"] = self._expert_return
         if distance is not None:
             row["wasserstein_to_expert"] = distance
-        self._metrics.evaluation(row)
-        metrics.write_learning_curve(
-            self._workdir / "learning_curve.png",
-            self._workdir / "eval.csv",
-            title=f"{self._config.method} on {self._config.task}, "
-            f"seed {self._config.seed}",
-            expert_return=self._expert_return,
-        )
-        if evaluation.video is not None:
-            self._write_video(evaluation.video, filmed, frame)
+        config = self._config
+        with writes_to(self._workdir):
+            self._evaluations.append(row)
+            self._events.write("eval", row)
+            learning_curve.plot(
+                self._workdir / "learning_curve.png",
+                self._workdir / "eval.csv",
+                title=f"{config.method} on {config.task}, seed {config.seed}",
+                expert_return=self._expert_return,
+            )
+            if evaluation.video is not None:
+                self._write_video(evaluation.video, filmed, frame)
         line = (
             f"frame {frame}: task return {evaluation.mean:.1f} ± {evaluation.std:.1f}"
         )
@@ -155,8 +181,19 @@ class Outputs:
         return line
 
     def close(self) -> None:
-        """Flushes and closes the tables."""
-        self._metrics.close()
+        """Closes the events' file."""
+        with writes_to(self._workdir):
+            self._events.close()
+
+    def _write_training(
+        self, frame: int, seconds: float, episode: int, values: Mapping[str, Any]
+    ) -> None:
+        self._pre_tanh = values.get("actor/pre_tanh", self._pre_tanh)
+        row = {"frame": frame, "seconds": round(seconds, 3), "episode": episode}
+        row |= values
+        with writes_to(self._workdir):
+            self._train.append(row)
+            self._events.write("train", row)
 
     def _write_video(
         self, agent_frames: np.ndarray, filmed: dict[str, np.ndarray], frame: int
@@ -165,13 +202,49 @@ class Outputs:
         folder.mkdir(exist_ok=True)
         packed = io.BytesIO()
         np.savez_compressed(packed, **filmed)  # pyright: ignore[reportArgumentType]
-        metrics.write_atomically(folder / f"frame_{frame:09d}.npz", packed.getvalue())
+        write_atomically(folder / f"frame_{frame:09d}.npz", packed.getvalue())
         video.write_video(
             folder / f"frame_{frame:09d}.mp4",
             agent_frames,
             self._expert_frames,
             fps=frames_per_second(len(agent_frames)),
         )
+
+
+class _Events:
+    """The same numbers for TensorBoard."""
+
+    def __init__(self, folder: pathlib.Path, resume_frame: int | None) -> None:
+        """Starts a file; on a resume, TensorBoard drops what is after that frame."""
+        from tensorboardX import event_file_writer  # slow to import
+        from tensorboardX.proto import event_pb2
+
+        messages: Any = event_pb2  # whose classes are made at run time
+        folder.mkdir(exist_ok=True)
+        # Not its SummaryWriter, whose thread dies of a full disk, and with it the
+        # program: it then waits for the thread without end.
+        self._writer = event_file_writer.EventsWriter(str(folder / "events"))
+        self._event = messages.Event
+        if resume_frame is not None:
+            start = messages.SessionLog(status=messages.SessionLog.START)
+            self._write(step=resume_frame + 1, session_log=start)
+
+    def write(self, group: str, row: Mapping[str, Any]) -> None:
+        """Writes one row of a table, each column as GROUP/COLUMN."""
+        values = [
+            {"tag": f"{group}/{column}", "simple_value": float(value)}
+            for column, value in row.items()
+            if column != "frame"
+        ]
+        self._write(step=int(row["frame"]), summary={"value": values})
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._writer.close()
+
+    def _write(self, **fields: Any) -> None:
+        self._writer.write_event(self._event(wall_time=time.time(), **fields))
+        self._writer.flush()
 
 
 def frames_per_second(num_images: int) -> float:

@@ -6,7 +6,7 @@ from typing import Any
 
 
 class Stopwatch:
-    """Adds up where the time goes."""
+    """Adds up the seconds of a run by what they are spent on."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {"environment": 0.0, "update": 0.0}
@@ -26,7 +26,7 @@ class Stopwatch:
 
 
 class TimedPool:
-    """A pool whose processes' time, as far as one waits for it, is "environment"."""
+    """A pool; the time that one waits for its processes counts as "environment"."""
 
     def __init__(self, pool: Any, stopwatch: Stopwatch) -> None:
         self.size = pool.size

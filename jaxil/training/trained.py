@@ -17,30 +17,19 @@ from jaxil.training.checkpoint import CheckpointError, Checkpoints
 
 
 class Trained(NamedTuple):
-    """What it takes to play a learned policy.
-
-    Attributes:
-      config: the run's settings.
-      environment: one of its own, apart from the training's.
-      act: observation -> mean action.
-      params: of encoder, actor and critic.
-      demonstrations: what the run imitates; None without.
-      frame: environment frames that the policy was trained for.
-      episode: training episodes so far.
-      seconds: wall-clock of the training.
-    """
+    """A learned policy and what it takes to play it."""
 
     config: Config
-    environment: PixelEnvironment
-    act: Callable[[np.ndarray], np.ndarray]
+    environment: PixelEnvironment  # a separate one, not the training's
+    act: Callable[[np.ndarray], np.ndarray]  # observation -> mean action
     params: LearnerParams
     demonstrations: loading.Demonstrations | None
-    frame: int
-    episode: int
-    seconds: float
+    frame: int  # environment frames of training
+    episode: int  # training episodes
+    seconds: float  # wall clock of the training
 
     def description(self) -> str:
-        """Says in a few words how the policy came to be."""
+        """Returns a few words on the training."""
         config = self.config
         return (
             f"{config.method} learner on {config.observation}, seed {config.seed}, "
@@ -49,13 +38,13 @@ class Trained(NamedTuple):
 
 
 def load(folder: pathlib.Path) -> Trained:
-    """Reads the newest whole checkpoint of a run; the run may be going on.
+    """Reads the newest whole checkpoint of a run, which may still be running.
 
     Args:
       folder: `--workdir` of the run.
 
     Raises:
-      UsageError: there is no run, no checkpoint, or it can't be read.
+      UsageError: there is no run, no checkpoint, or none can be read.
     """
     config = workdir.read_config(folder)
     faults = assembly.problems(config)

@@ -10,7 +10,7 @@ from jaxil.demonstrations import loading
 from jaxil.learner.gathering import Frames
 from jaxil.learner.state import TrainState
 from jaxil.maths.types import Batch, ExpertBatch, ExpertEpisodes, Metrics
-from jaxil.replay.device_copy import Mirror
+from jaxil.replay.device_copy import DeviceCopy
 from jaxil.replay.replay import Replay
 from jaxil.training.agent import Agent, stack_size
 
@@ -50,11 +50,11 @@ class Updates:
         self._experts = experts
         self._pending: list[Sampled] = []
         self._plays = methods.get(config.method).plays
-        self._device_copy: Mirror | None = None
+        self._device_copy: DeviceCopy | None = None
         self._expert_frames: jax.Array | None = None
         if config.replay_on_device:
             if self._plays:
-                self._device_copy = Mirror(replay)
+                self._device_copy = DeviceCopy(replay)
             if experts is not None:
                 self._expert_frames = experts.frames  # no second copy
             elif demonstrations is not None and agent.rewarder.expert_batch_size:
@@ -109,7 +109,7 @@ class Updates:
         """
         replay = self._replay
         by_length: dict[int, list[int]] = {}
-        for index in range(replay.oldest_episode, replay.num_episodes_added):
+        for index in replay.episodes:
             by_length.setdefault(len(replay.slots(index)), []).append(index)
         for indices in by_length.values():
             for first in range(0, len(indices), _REFRESH_EPISODES):

@@ -1,27 +1,59 @@
 """The folder of a run: who may write there, and with which settings."""
 
 import contextlib
-import fcntl
 import json
 import os
 import pathlib
+import re
 from collections.abc import Iterator
 from typing import Any
 
+from jaxil import config as jaxil_config
 from jaxil.config import Config, default_config
-from jaxil.errors import UsageError
+from jaxil.errors import Fault, UsageError
+from jaxil.files import locking, writing
+from jaxil.files.settings import as_stored, flat
 
-# A run may be prolonged, or be computed in another way, without becoming another run.
-_FREE_FIELDS = ("total_frames", "encoder.convolutions", "replay_on_device")
-# Older runs have these, which said how something is computed and nothing else.
-_FORMER_FIELDS = (("encoder", "chunk_size"),)
+# Its frame; a second number tells two checkpoints of one frame apart.
+CHECKPOINT = re.compile(r"frame_(\d{12,})(?:_(\d+))?")
+# No file of a run takes longer between two writes.
+_LEFTOVER_SECONDS = 60.0
 
 
-def problems(workdir: pathlib.Path, config: Config) -> list[str]:
-    """Returns one sentence for each reason why a run can't live in a folder.
+class RunFolderError(Exception):
+    """The files of a run cannot be written or read; the message says what to do."""
+
+
+def from_flag(value: str | None) -> pathlib.Path:
+    """Returns the folder that `--workdir` names.
+
+    Raises:
+      UsageError: it is missing or empty, or no name that a file can have.
+    """
+    if not value:
+        raise UsageError(
+            "--workdir is missing or empty: name a folder, such as --workdir=runs/1"
+        )
+    path = pathlib.Path(value)
+    try:
+        longest = max(len(part.encode()) for part in path.absolute().parts)
+    except UnicodeEncodeError as error:
+        raise UsageError(
+            f"--workdir={value!r} is not UTF-8; choose a name that is"
+        ) from error
+    if longest > 255 or "\0" in value:
+        raise UsageError(
+            f"--workdir={value[:40]!r}... has a name of {longest} bytes: expected at "
+            "most 255, none of them zero; choose another"
+        )
+    return path
+
+
+def problems(workdir: pathlib.Path, config: Config) -> list[Fault]:
+    """Returns every reason why a run cannot live in a folder.
 
     Args:
-      workdir: need not exist; it is not made.
+      workdir: need not exist; it is not created.
       config: must be that of the run that is in the folder already, if there is one.
     """
     parent = workdir
@@ -29,74 +61,120 @@ def problems(workdir: pathlib.Path, config: Config) -> list[str]:
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         return [
-            f"workdir={str(workdir)!r} can't be written: {parent} must be a folder "
-            "that you may write; choose another with --workdir=DIR"
+            Fault(
+                "workdir",
+                f"is not writable: {parent} must be a folder that you may write to",
+                "choose another with --workdir=DIR",
+                str(workdir),
+            )
         ]
     if not (workdir / "config.json").exists():
         return []
     try:
         before = read_config(workdir)
     except UsageError as error:
-        return [str(error)]
+        return [Fault("workdir", f"cannot be resumed: {error}", value=str(workdir))]
     different = _differences(before, config)
     if different:
         return [
-            f"workdir={str(workdir)!r} holds a run with other settings ("
-            + "; ".join(different)
-            + "): use the same to go on with it, or another --workdir"
+            Fault(
+                "workdir",
+                f"holds a run with other settings ({'; '.join(different)})",
+                "use the same to resume it, or another --workdir",
+                str(workdir),
+            )
         ]
     return []
 
 
 @contextlib.contextmanager
 def opened(workdir: pathlib.Path) -> Iterator[None]:
-    """Makes the folder and keeps other processes out of it while it is open.
+    """Creates the folder and keeps other processes out of it while it is open.
+
+    What killed processes left unfinished there is removed.
 
     Raises:
-      UsageError: the folder can't be written or is in use.
+      UsageError: the folder is not writable or in use.
     """
-    try:
-        workdir.mkdir(parents=True, exist_ok=True)
-        lock = (workdir / "lock").open("w")
-    except OSError as error:
-        raise UsageError(
-            f"workdir={str(workdir)!r} can't be written ({error.strerror}); choose a "
-            "folder of your own with --workdir=DIR"
-        ) from error
-    with lock:
+    with contextlib.ExitStack() as stack:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            workdir.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(locking.locked(workdir / "lock"))
+            for folder in (workdir, workdir / "videos"):
+                writing.remove_leftovers(folder, min_age_seconds=_LEFTOVER_SECONDS)
+        except locking.InUseError as error:
+            raise UsageError(
+                f"workdir={str(workdir)!r} is {error}; wait for it or choose another "
+                "folder with --workdir=DIR"
+            ) from error
         except OSError as error:
             raise UsageError(
-                f"workdir={str(workdir)!r} is in use by another process; wait for it "
-                "or choose another folder with --workdir=DIR"
+                f"workdir={str(workdir)!r} is not writable ({error.strerror}); choose "
+                "a folder of your own with --workdir=DIR"
             ) from error
         yield
+
+
+@contextlib.contextmanager
+def writes_to(workdir: pathlib.Path) -> Iterator[None]:
+    """Turns an OSError in the block, where a run's own files are written, into one.
+
+    Raises:
+      RunFolderError: names the fault, the newest checkpoint and the way out.
+    """
+    try:
+        yield
+    except OSError as error:
+        if not workdir.is_dir():
+            raise RunFolderError(
+                f"workdir={str(workdir)!r} has been deleted or moved; if it was moved, "
+                "rerun the command with its new name to resume from its newest "
+                "checkpoint"
+            ) from error
+        name = f" ({pathlib.Path(error.filename).name})" if error.filename else ""
+        newest = newest_checkpoint(workdir)
+        checkpoint = "none yet" if newest is None else f"of frame {newest}"
+        raise RunFolderError(
+            f"workdir={str(workdir)!r} cannot be written: {error.strerror or error}"
+            f"{name}; newest checkpoint: {checkpoint}. Make room or make it writable, "
+            "then rerun the same command to resume"
+        ) from error
+
+
+def newest_checkpoint(workdir: pathlib.Path) -> int | None:
+    """Returns the environment frame of the newest checkpoint in a folder, or None."""
+    names = [path.name for path in (workdir / "checkpoints").glob("frame_*")]
+    matches = [match for name in names if (match := CHECKPOINT.fullmatch(name))]
+    return max((int(match[1]) for match in matches), default=None)
 
 
 def read_config(workdir: pathlib.Path) -> Config:
     """Returns the config of the run in a folder.
 
     Fields that did not exist when it was written have their defaults: these are what
-    was done before there was a choice. Those that exist no longer are left out.
+    was done before there was a choice. Those that no longer exist are left out.
 
     Raises:
-      UsageError: there is none, or it can't be read.
+      UsageError: there is none, or it cannot be read.
     """
     path = workdir / "config.json"
     try:
         stored = json.loads(path.read_text())["config"]
         config = default_config(stored["method"], stored["task"])
-        for section, field in _FORMER_FIELDS:
-            stored.get(section, {}).pop(field, None)
-        config.update(stored)
+        known = jaxil_config.fields(stored["method"])
+        there = flat(stored)
+        for field in known.keys() & there.keys():
+            group, _, leaf = field.rpartition(".")
+            value = there[field]
+            target = config[group] if group else config
+            target[leaf] = tuple(value) if isinstance(value, list) else value
         return config
     except OSError as error:
         raise UsageError(
-            f"workdir={str(workdir)!r} holds no run: {path} can't be read "
+            f"workdir={str(workdir)!r} holds no run: {path} is not readable "
             f"({error.strerror}); give the --workdir of a `jaxil.launch`"
         ) from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UsageError(
             f"{path} is damaged ({error}); restore it, or start in another folder"
         ) from error
@@ -105,29 +183,20 @@ def read_config(workdir: pathlib.Path) -> Config:
 def write_config(
     workdir: pathlib.Path, config: Config, machine: dict[str, Any]
 ) -> None:
-    """Writes config.json: every setting in force, and what it runs on."""
+    """Writes config.json: every setting in force, and what it runs on.
+
+    Raises:
+      RunFolderError: the folder is not writable.
+    """
     text = json.dumps({"config": config.to_dict(), **machine}, indent=2)
-    temporary = workdir / f"config.json.{os.getpid()}.tmp"
-    temporary.write_text(text + "\n")
-    os.replace(temporary, workdir / "config.json")
+    with writes_to(workdir):
+        writing.write_atomically(workdir / "config.json", f"{text}\n".encode())
 
 
 def _differences(there: Config, here: Config) -> list[str]:
-    # Through JSON, which turns tuples into lists, so that both have the same types.
-    before = _flat(json.loads(json.dumps(there.to_dict())))
-    now = _flat(json.loads(json.dumps(here.to_dict())))
+    before, now = flat(as_stored(there.to_dict())), flat(as_stored(here.to_dict()))
     return [
         f"{field}: {before.get(field)!r} there, {now.get(field)!r} here"
         for field in sorted(before.keys() | now.keys())
-        if before.get(field) != now.get(field) and field not in _FREE_FIELDS
+        if before.get(field) != now.get(field) and field not in jaxil_config.FREE_FIELDS
     ]
-
-
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    leaves: dict[str, Any] = {}
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            leaves.update(_flat(value, f"{prefix}{name}."))
-        else:
-            leaves[f"{prefix}{name}"] = value
-    return leaves

@@ -21,7 +21,7 @@ import time
 from collections.abc import Iterator
 from typing import IO, NamedTuple
 
-from jaxil.files.metrics import write_atomically
+from jaxil.files.writing import write_atomically
 from launch.sweeps.plan import Run
 
 _CHECKPOINT = re.compile(r"frame_(\d+)(?:_\d+)?")

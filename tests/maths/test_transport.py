@@ -160,3 +160,52 @@ class TransportRewardsTest(chex.TestCase):
         rewards = transport.transport_rewards(cost, plan)
         assert np.all(np.asarray(rewards) <= 0.0)
         np.testing.assert_allclose(rewards.sum(), -np.vdot(cost, plan), rtol=1e-6)
+
+
+def _brute_force_transport_cost(x, y, epsilon):
+    """Entropic transport cost by plain scaling in float64: <P, C> + eps KL(P | ab)."""
+    x, y = (np.asarray(each, np.float64) for each in (x, y))
+    unit = [each / np.linalg.norm(each, axis=1, keepdims=True) for each in (x, y)]
+    cost = 1.0 - unit[0] @ unit[1].T
+    kernel = np.exp(-cost / epsilon) / cost.size  # of the masses' product too
+    u = np.ones(len(x))
+    for _ in range(5000):
+        v = 1.0 / len(y) / (kernel.T @ u)
+        u = 1.0 / len(x) / (kernel @ v)
+    plan = u[:, None] * kernel * v
+    return np.sum(plan * cost) + epsilon * np.sum(plan * np.log(plan * cost.size))
+
+
+def test_sinkhorn_divergence_against_brute_force_and_ott():
+    from ott.geometry import costs, pointcloud
+    from ott.tools import sinkhorn_divergence
+
+    rng, epsilon = np.random.default_rng(0), 0.2
+    x, y = (jnp.asarray(rng.normal(size=(n, 4)), jnp.float32) for n in (7, 5))
+    ours = transport.sinkhorn_divergence(x, y, epsilon=epsilon, num_iterations=300)
+
+    def cost(one, other):
+        return _brute_force_transport_cost(one, other, epsilon)
+
+    expected = cost(x, y) - (cost(x, x) + cost(y, y)) / 2
+    np.testing.assert_allclose(ours, expected, rtol=1e-4)
+    with jax.numpy_rank_promotion("allow"):
+        theirs, _ = sinkhorn_divergence.sinkhorn_divergence(
+            pointcloud.PointCloud, x, y, cost_fn=costs.Cosine(), epsilon=epsilon
+        )
+    np.testing.assert_allclose(ours, theirs, rtol=1e-2)
+
+
+def test_sinkhorn_divergence_of_equal_sets_is_zero_and_it_is_symmetric():
+    rng = np.random.default_rng(1)
+    # As near to each other as features of a random encoder: entropy blurs them.
+    near = 1.0 + 0.1 * rng.normal(size=(2, 30, 8))
+    x, y = jnp.asarray(near, jnp.float32)
+    divergence = functools.partial(
+        transport.sinkhorn_divergence, epsilon=0.01, num_iterations=100
+    )
+    np.testing.assert_allclose(divergence(x, x), 0.0, atol=1e-6)
+    np.testing.assert_allclose(divergence(x, x[::-1]), 0.0, atol=1e-6)
+    np.testing.assert_allclose(divergence(x, y), divergence(y, x), rtol=1e-3)
+    further = divergence(x, y + jnp.linspace(0.0, 1.0, 8))
+    assert 0.0 < divergence(x, y) < further

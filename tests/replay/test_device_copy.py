@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxil.learner.gathering import gather_batch, gather_expert, gather_stacks
-from jaxil.maths.types import Batch, ExpertBatch, Window
-from jaxil.replay import device_copy as host_mirror
-from jaxil.replay.device_copy import Mirror
+from jaxil.maths.types import ExpertBatch
+from jaxil.replay import device_copy
+from jaxil.replay.device_copy import DeviceCopy
 from jaxil.replay.replay import Replay
 
 CAPACITY, EPISODE, BATCH = 24, 6, 16
@@ -42,13 +42,7 @@ def add_episode(replay: Replay, num_steps: int, rng: np.random.Generator) -> Non
 
 
 def stored_slots(replay: Replay) -> np.ndarray:
-    numbers = range(replay.oldest_episode, replay.num_episodes_added)
-    return np.concatenate([replay.slots(number) for number in numbers])
-
-
-def as_learner_s(batch) -> Batch:
-    window = batch.window
-    return Batch(*batch[:-1], window=None if window is None else Window(*window))
+    return np.concatenate([replay.slots(number) for number in replay.episodes])
 
 
 @settings(deadline=None, max_examples=60)
@@ -65,14 +59,14 @@ def test_stacks_from_the_device_are_those_of_the_host(
 ):
     rng = np.random.default_rng(seed)
     replay = make_replay(pixels)
-    mirror = Mirror(replay, block_frames=block_frames)
+    copy = DeviceCopy(replay, block_frames=block_frames)
     for number, length in enumerate(lengths):
         add_episode(replay, length, rng)
         if number % refreshed == 0:  # some see many episodes at once, some lost ones
-            mirror.refresh()
-    mirror.refresh()
+            copy.refresh()
+    copy.refresh()
     slots = stored_slots(replay)
-    np.testing.assert_array_equal(mirror.frames[slots], replay.frames[slots])
+    np.testing.assert_array_equal(copy.frames[slots], replay.frames[slots])
     if not replay.can_sample():
         return
     whole, places = (
@@ -80,8 +74,8 @@ def test_stacks_from_the_device_are_those_of_the_host(
         for draw in (replay.sample, replay.sample_indices)
     )
     assert places.observation.dtype == np.int32
-    gathered = GATHER(mirror.frames, as_learner_s(places))
-    leaves = jax.tree.leaves(gathered), jax.tree.leaves(as_learner_s(whole))
+    gathered = GATHER(copy.frames, places)
+    leaves = jax.tree.leaves(gathered), jax.tree.leaves(whole)
     for ours, theirs in zip(*leaves, strict=True):
         assert ours.dtype == theirs.dtype
         np.testing.assert_array_equal(ours, theirs)
@@ -104,30 +98,30 @@ def test_expert_frames_lie_end_to_end():
     np.testing.assert_array_equal(gather_expert(frames, drawn).observation, expected)
 
 
-def test_a_mirror_of_a_filled_replay_and_its_one_compilation():
+def test_a_copy_of_a_filled_replay_and_its_one_compilation():
     rng, replay = np.random.default_rng(0), make_replay(True)
     for length in (6, 6, 6, 6, 5):
         add_episode(replay, length, rng)
-    write: Any = host_mirror._write
+    write: Any = device_copy._write
     write.clear_cache()
-    mirror = Mirror(replay, block_frames=4)  # 28 slots, the last block overlaps none
+    copy = DeviceCopy(replay, block_frames=4)  # 28 slots, the last block overlaps none
     for length in (1, 9, 4):
         add_episode(replay, length, rng)
-        mirror.refresh()
+        copy.refresh()
     slots = stored_slots(replay)
-    np.testing.assert_array_equal(mirror.frames[slots], replay.frames[slots])
+    np.testing.assert_array_equal(copy.frames[slots], replay.frames[slots])
     assert write._cache_size() == 1
 
 
 def test_the_ring_may_change_while_a_block_travels():
     rng, replay = np.random.default_rng(0), make_replay(True)
     add_episode(replay, 6, rng)
-    mirror = Mirror(replay)
-    before = np.array(mirror.frames[:7])
+    copy = DeviceCopy(replay)
+    before = np.array(copy.frames[:7])
     add_episode(replay, 6, rng)
-    for _ in range(3):  # over the first episode's slots, without telling the mirror
+    for _ in range(3):  # over the first episode's slots, without telling the copy
         add_episode(replay, 8, rng)
-    np.testing.assert_array_equal(mirror.frames[:7], before)
+    np.testing.assert_array_equal(copy.frames[:7], before)
 
 
 def test_the_ring_can_t_be_written_through_the_property():

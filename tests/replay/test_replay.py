@@ -97,11 +97,10 @@ def test_samples_are_windows_of_the_newest_episodes(
         ):
             plain.pop(0)
 
-        assert replay.check_valid() == (True, "")
         assert replay.num_steps_stored == sum(len(kept["rewards"]) for kept in plain)
-        assert replay.num_episodes_stored == len(plain)
         assert replay.num_episodes_added == number + 1
-        assert replay.oldest_episode == number + 1 - len(plain)
+        assert replay.episodes == list(range(number + 1 - len(plain), number + 1))
+        assert replay.oldest_episode == replay.episodes[0]
         for index, kept in enumerate(plain, start=replay.oldest_episode):
             stored = replay.episode(index)._asdict()
             for name, array in kept.items():
@@ -306,7 +305,6 @@ def test_a_bad_episode_is_refused_whole(changes, message):
 
     assert replay.num_episodes_added == 1
     assert replay.num_steps_stored == 12
-    assert replay.check_valid() == (True, "")
 
 
 def test_an_episode_longer_than_the_replay_is_refused():
@@ -331,7 +329,9 @@ def test_only_stored_episodes_can_be_read():
         replay.add_episode(**make_episode(4, seed))
 
     for index in (0, 4, -1):
-        with pytest.raises(IndexError, match="the replay holds 1 to 3"):
+        with pytest.raises(
+            IndexError, match="the replay holds 3 of the episodes 1 to 3"
+        ):
             replay.episode(index)
 
 
@@ -351,3 +351,45 @@ def test_only_stored_episodes_can_be_read():
 def test_bad_sizes_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         make_replay(**changes)
+
+
+def test_a_skipped_number_leaves_a_gap():
+    replay = make_replay()  # of 12 steps
+    replay.clear(5)
+    replay.add_episode(**make_episode(4, 5))
+    replay.skip_episode()
+    for seed in (7, 8):
+        replay.add_episode(**make_episode(4, seed))
+    assert replay.episodes == [5, 7, 8]
+    assert replay.num_episodes_added == 9
+    with pytest.raises(IndexError, match="episode 6 is not stored"):
+        replay.episode(6)
+    for index in replay.episodes:
+        frames = make_episode(4, index)["frames"]
+        np.testing.assert_array_equal(replay.episode(index).frames, frames)
+    windows = windows_of(
+        [make_episode(4, seed) for seed in (5, 7, 8)],
+        frame_stack=3,
+        num_steps=3,
+        discount_factor=0.5,
+    )
+    batch = replay.sample(np.random.default_rng(0), 200)
+    pairs = zip(batch.observation, batch.next_observation, strict=True)
+    assert {tuple(o.tobytes() for o in ends) for ends in pairs} == set(windows)
+    replay.add_episode(**make_episode(8, 9))
+    assert replay.episodes == [8, 9]
+
+
+def test_replaced_rewards():
+    replay = make_replay()
+    for seed in range(2):
+        replay.add_episode(**make_episode(4, seed))
+    replay.replace_rewards(1, [1, 2, 3, 4])
+    np.testing.assert_array_equal(replay.rewards(1), [1, 2, 3, 4])
+    total = make_episode(4, 0)["rewards"].sum(dtype=np.float64) + 10.0
+    assert replay.mean_reward() == pytest.approx(total / 8)
+    for wrong in ([1, 2], [1, 2, 3, np.nan]):
+        with pytest.raises(ValueError, match="rewards"):
+            replay.replace_rewards(1, wrong)
+    np.testing.assert_array_equal(replay.rewards(1), [1, 2, 3, 4])
+    assert np.isnan(make_replay().mean_reward())

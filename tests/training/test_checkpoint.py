@@ -1,7 +1,9 @@
 """Checkpoints: round trips, increments, kills in mid-save, damage."""
 
+import errno
 import pathlib
 import random
+import shutil
 import subprocess
 import sys
 import time
@@ -12,8 +14,11 @@ import numpy as np
 import orbax.checkpoint
 import pytest
 
+from jaxil.replay import episode_files
 from jaxil.replay.replay import Replay
+from jaxil.training import learner_files
 from jaxil.training.checkpoint import CheckpointError, Checkpoints
+from jaxil.training.workdir import RunFolderError
 
 
 def make_replay() -> Replay:
@@ -66,15 +71,14 @@ def assert_same_state(one, other) -> None:
 
 
 def assert_same_replay(one: Replay, other: Replay) -> None:
-    assert other.check_valid() == (True, "")
-    assert one.oldest_episode == other.oldest_episode
+    assert one.episodes == other.episodes
     assert one.num_episodes_added == other.num_episodes_added
-    for index in range(one.oldest_episode, one.num_episodes_added):
+    for index in one.episodes:
         for a, b in zip(one.episode(index), other.episode(index), strict=True):
             np.testing.assert_array_equal(a, b)
 
 
-def episode_files(workdir) -> dict:
+def episode_files_of(workdir) -> dict:
     """Names of the episode files, with what tells whether one was written again."""
     stats = {path.name: path.stat() for path in (workdir / "replay").iterdir()}
     return {name: (stat.st_ino, stat.st_mtime_ns) for name, stat in stats.items()}
@@ -145,10 +149,10 @@ def test_episodes_are_written_once_and_go_after_the_checkpoints_that_need_them(
     checkpoints, replay = Checkpoints(tmp_path), make_replay()
     add_episodes(replay, 2)
     save(checkpoints, 1, replay)
-    before = episode_files(tmp_path)
+    before = episode_files_of(tmp_path)
     add_episodes(replay, 2)  # 0 is evicted: three fit
     save(checkpoints, 2, replay)
-    after = episode_files(tmp_path)
+    after = episode_files_of(tmp_path)
 
     assert len(before) == 2
     assert set(after) == {f"episode_{i:08d}.npz" for i in range(4)}
@@ -158,16 +162,18 @@ def test_episodes_are_written_once_and_go_after_the_checkpoints_that_need_them(
     save(checkpoints, 3, replay)
 
     # Kept are the checkpoints 2 (episodes 1 to 3) and 3 (2 to 4).
-    assert set(episode_files(tmp_path)) == {f"episode_{i:08d}.npz" for i in range(1, 5)}
+    assert set(episode_files_of(tmp_path)) == {
+        f"episode_{i:08d}.npz" for i in range(1, 5)
+    }
     names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
     assert names == ["frame_000000000002", "frame_000000000003"]
 
 
-def test_a_resumed_run_goes_on_where_the_files_end(tmp_path):
+def test_a_resumed_run_writes_only_what_is_new(tmp_path):
     replay = make_replay()
     add_episodes(replay, 3)
     save(Checkpoints(tmp_path), 1, replay)
-    before = episode_files(tmp_path)
+    before = episode_files_of(tmp_path)
 
     checkpoints, resumed = Checkpoints(tmp_path), make_replay()
     checkpoints.restore(ABSTRACT, resumed)
@@ -175,7 +181,7 @@ def test_a_resumed_run_goes_on_where_the_files_end(tmp_path):
     save(checkpoints, 2, resumed)
     add_episodes(replay, 2)
 
-    after = episode_files(tmp_path)
+    after = episode_files_of(tmp_path)
     assert {name: after[name] for name in before} == before
     again = make_replay()
     Checkpoints(tmp_path).restore(ABSTRACT, again)
@@ -204,7 +210,7 @@ def test_a_kill_in_mid_save_leaves_a_whole_checkpoint(tmp_path, monkeypatch, mom
             write = np.lib.format.write_array
 
             def die_in_the_second(file, array, **options):
-                if "episode_00000005.npz" in episode_files(tmp_path):
+                if "episode_00000005.npz" in episode_files_of(tmp_path):
                     raise Killed
                 write(file, array, **options)
 
@@ -222,11 +228,11 @@ def test_a_kill_in_mid_save_leaves_a_whole_checkpoint(tmp_path, monkeypatch, mom
             patched.setattr(orbax.checkpoint.Checkpointer, "save", write_half)
         elif moment == "rename":
             patched.setattr(
-                "jaxil.training.checkpoint.os.replace",
+                "jaxil.files.writing.os.replace",
                 lambda old, new: kill() if "frame_" in str(new) else old.rename(new),
             )
         else:
-            patched.setattr("jaxil.training.checkpoint.shutil.rmtree", kill)
+            patched.setattr("jaxil.files.writing.shutil.rmtree", kill)
         with pytest.raises(Killed):
             save(checkpoints, 3, replay, note="third")
 
@@ -240,7 +246,7 @@ def test_a_kill_in_mid_save_leaves_a_whole_checkpoint(tmp_path, monkeypatch, mom
         assert_same_state(make_state(2), state)
         assert_same_replay(at_second, restored)
 
-    # The resumed run writes episode 5 anew, leftovers go, and all is whole again.
+    # The resumed run rewrites episode 5, leftovers are removed, all is whole again.
     add_episodes(restored, 1)
     save(survivor, 4, restored, note="fourth")
     again = make_replay()
@@ -270,10 +276,10 @@ def test_a_damaged_newest_checkpoint_falls_back(tmp_path, seed):
     assert_same_replay(at_first, restored)
     assert len(said) == 1
     assert said[0].startswith("the checkpoint of frame 2 is damaged (")
-    assert said[0].endswith(": going on from frame 1")
+    assert said[0].endswith(": resuming from frame 1")
     assert "\n" not in said[0]
 
-    # Going on: another episode 4 than the damaged checkpoint knew, and another frame 2.
+    # Resumed: another episode 4 than the damaged checkpoint knew, and another frame 2.
     add_episodes(restored, 1, num_steps=3)
     save(survivor, 2, restored)
     again = make_replay()
@@ -282,26 +288,257 @@ def test_a_damaged_newest_checkpoint_falls_back(tmp_path, seed):
     assert len(said) == 1
 
 
-@pytest.mark.parametrize("damage", ["missing", "cut off", "other shape"])
-def test_a_damaged_episode_falls_back(tmp_path, damage):
+def _flag_members(path, offset, value):
+    """Changes one field of the zip's headers: what a member says of itself."""
+    content = bytearray(path.read_bytes())
+    for signature, shift in ((b"PK\x03\x04", 0), (b"PK\x01\x02", 2)):
+        place = content.find(signature)
+        while place >= 0:
+            content[place + offset + shift] = value
+            place = content.find(signature, place + 1)
+    path.write_bytes(bytes(content))
+
+
+def _become_a_folder(path):
+    path.unlink()
+    (path / "inner").mkdir(parents=True)
+
+
+DAMAGES = {
+    "missing": lambda path: path.unlink(),
+    "cut off": lambda path: path.write_bytes(path.read_bytes()[:-100]),
+    "empty": lambda path: path.write_bytes(b""),
+    "a folder": _become_a_folder,
+    "other shape": lambda path: np.savez(
+        path, frames=1, actions=1, rewards=1, discounts=1
+    ),
+    "encrypted": lambda path: _flag_members(path, 6, 1),
+    "unknown compression": lambda path: _flag_members(path, 8, 99),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_episode_is_left_out_and_named(tmp_path, damage):
     checkpoints, replay = Checkpoints(tmp_path), make_replay()
-    add_episodes(replay, 2)
+    add_episodes(replay, 3)
     save(checkpoints, 1, replay)
+    DAMAGES[damage](tmp_path / "replay" / "episode_00000001.npz")
+
+    said, restored = [], make_replay()
+    checkpoints = Checkpoints(tmp_path, say=said.append)
+    state, _ = checkpoints.restore(ABSTRACT, restored)
+
+    assert_same_state(make_state(1), state)
+    assert restored.episodes == [0, 2]
+    for index in restored.episodes:
+        for a, b in zip(restored.episode(index), replay.episode(index), strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert len(said) == 1
+    assert said[0].startswith("1 damaged episodes are left out of the replay (episode_")
+    assert "episode_00000001.npz: " in said[0]
+
+    # Resumed: its numbers go on, and later checkpoints have the gap without a word,
+    # until the ring has moved past it.
+    for frame in range(2, 6):
+        add_episodes(restored, 1)
+        save(checkpoints, frame, restored)
+        again = make_replay()
+        Checkpoints(tmp_path, say=said.append).restore(ABSTRACT, again)
+        assert_same_replay(restored, again)
+    assert again.episodes == [4, 5, 6]
+    assert len(said) == 1
+    assert not (tmp_path / "replay" / "episode_00000001.npz").exists()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_flipped_bit_in_an_episode_is_harmless_or_noticed(tmp_path, seed):
+    replay, rng = make_replay(), random.Random(seed)
     add_episodes(replay, 1)
-    save(checkpoints, 2, replay)
-    path = tmp_path / "replay" / "episode_00000002.npz"
-    if damage == "missing":
-        path.unlink()
-    elif damage == "cut off":
-        path.write_bytes(path.read_bytes()[:-100])
+    episode_files.write(tmp_path, replay, 0)
+    path = tmp_path / "episode_00000000.npz"
+    content = bytearray(path.read_bytes())
+    content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
+    path.write_bytes(bytes(content))
+
+    restored = make_replay()
+    fault = episode_files.read_into(restored, tmp_path, 0)
+
+    assert restored.num_episodes_added == 1
+    if fault is None:
+        assert_same_replay(replay, restored)
     else:
-        np.savez(path, frames=1, actions=1, rewards=1, discounts=1)
+        assert fault.startswith("episode_00000000.npz: ")
+        assert "\n" not in fault
+
+
+def test_exchanged_episodes_are_noticed(tmp_path):
+    replay = make_replay()
+    add_episodes(replay, 3)
+    save(Checkpoints(tmp_path), 1, replay)
+    first, second = (
+        tmp_path / "replay" / f"episode_{index:08d}.npz" for index in (0, 2)
+    )
+    first.rename(tmp_path / "aside")
+    second.rename(first)
+    (tmp_path / "aside").rename(second)
 
     said, restored = [], make_replay()
     Checkpoints(tmp_path, say=said.append).restore(ABSTRACT, restored)
 
-    assert restored.num_episodes_added == 2
-    assert "episode_00000002.npz" in said[0]
+    assert restored.episodes == [1]
+    assert "episode_00000000.npz: holds episode 2" in said[0]
+
+
+def test_without_any_episode_the_learner_is_resumed(tmp_path):
+    replay = make_replay()
+    add_episodes(replay, 5)
+    save(Checkpoints(tmp_path), 1, replay)
+    shutil.rmtree(tmp_path / "replay")
+
+    said, restored = [], make_replay()
+    checkpoints = Checkpoints(tmp_path, say=said.append)
+    checkpoints.restore(ABSTRACT, restored)
+    assert restored.episodes == []
+    assert restored.num_episodes_added == 5
+    add_episodes(restored, 1)
+    save(checkpoints, 2, restored)
+    again = make_replay()
+    Checkpoints(tmp_path).restore(ABSTRACT, again)
+    assert again.episodes == [5]
+    assert len(said) == 1
+
+
+def test_replaced_rewards_come_back(tmp_path):
+    checkpoints, replay = Checkpoints(tmp_path), make_replay()
+    for num_steps in (4, 2, 3):
+        add_episodes(replay, 1, num_steps)
+    save(checkpoints, 1, replay)
+    before = episode_files_of(tmp_path)
+    for index in replay.episodes:
+        replay.replace_rewards(index, -replay.rewards(index))
+    save(checkpoints, 2, replay)
+
+    assert episode_files_of(tmp_path) == before
+    restored = make_replay()
+    Checkpoints(tmp_path).restore(ABSTRACT, restored)
+    assert_same_replay(replay, restored)
+
+    # The others' also where one episode has been lost.
+    (tmp_path / "replay" / "episode_00000001.npz").unlink()
+    Checkpoints(tmp_path, say=lambda _: None).restore(ABSTRACT, restored)
+    for index in (0, 2):
+        np.testing.assert_array_equal(restored.rewards(index), replay.rewards(index))
+
+
+@pytest.mark.parametrize("has_rewards", [False, True])
+def test_a_checkpoint_of_an_earlier_version_is_restored(
+    tmp_path, monkeypatch, has_rewards
+):
+    # Without rewards, at first; without a list of episodes and numbers in their files.
+    replay, write = make_replay(), learner_files.write
+    add_episodes(replay, 2)
+
+    def write_as_before(folder, state, record, arrays):
+        del record["episodes"], record["episode_steps"]
+        write(folder, state, record, arrays if has_rewards else {})
+
+    monkeypatch.setattr(learner_files, "write", write_as_before)
+    save(Checkpoints(tmp_path), 1, replay)
+    for index in range(2):
+        arrays: dict = replay.episode(index)._asdict()
+        np.savez(tmp_path / "replay" / f"episode_{index:08d}.npz", **arrays)
+        if has_rewards:
+            arrays["rewards"] = arrays["rewards"] * 0
+            np.savez(tmp_path / "replay" / f"episode_{index:08d}.npz", **arrays)
+
+    restored = make_replay()
+    Checkpoints(tmp_path).restore(ABSTRACT, restored)
+    assert_same_replay(replay, restored)
+
+
+def test_strays_are_ignored(tmp_path):
+    replay = make_replay()
+    add_episodes(replay, 2)
+    save(Checkpoints(tmp_path), 1, replay)
+    for folder in [path for path in tmp_path.rglob("*") if path.is_dir()]:
+        (folder / ".DS_Store").write_bytes(b"\0\0\0\1Bud1")
+    (tmp_path / "checkpoints" / "frame_000000000009.bak").mkdir()
+
+    said, restored = [], make_replay()
+    checkpoints = Checkpoints(tmp_path, say=said.append)
+    checkpoints.restore(ABSTRACT, restored)
+    assert said == []
+    assert_same_replay(replay, restored)
+    save(checkpoints, 2, restored)
+    save(checkpoints, 3, restored)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda path: (path / "checksums.json").write_text("[" * 200_000),
+        lambda path: (path / "checksums.json").write_text("{}"),
+        lambda path: (path / "checksums.json").write_bytes(b"\xff"),
+        lambda path: (shutil.rmtree(path), path.write_text("a file")),
+        lambda path: (shutil.rmtree(path), path.mkdir()),
+    ],
+    ids=["deep JSON", "no sums", "not UTF-8", "a file", "empty"],
+)
+def test_an_odd_newest_checkpoint_falls_back(tmp_path, spoil):
+    checkpoints, replay = Checkpoints(tmp_path), make_replay()
+    save(checkpoints, 1, replay)
+    save(checkpoints, 2, replay)
+    spoil(tmp_path / "checkpoints" / "frame_000000000002")
+    said = []
+    checkpoints = Checkpoints(tmp_path, say=said.append)
+    state, _ = checkpoints.restore(ABSTRACT, replay)
+    assert_same_state(make_state(1), state)
+    assert len(said) == 1
+    save(checkpoints, 3, replay)  # which removes it
+    assert Checkpoints(tmp_path).newest() == 3
+    names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
+    assert names == ["frame_000000000001", "frame_000000000003"]
+
+
+@pytest.mark.parametrize("what", ["episode", "learner", "folder"])
+def test_a_full_disk_leaves_the_checkpoint_before(tmp_path, monkeypatch, what):
+    checkpoints, replay = Checkpoints(tmp_path), make_replay()
+    add_episodes(replay, 1)
+    save(checkpoints, 1, replay)
+    add_episodes(replay, 1)
+
+    def fail(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def fail_in_tensorstore(*_, **__):
+        raise ValueError("RESOURCE_EXHAUSTED: No space left on device")
+
+    with monkeypatch.context() as patched:
+        if what == "episode":
+            patched.setattr(np.lib.format, "write_array", fail)
+        elif what == "learner":
+            patched.setattr(orbax.checkpoint.Checkpointer, "save", fail_in_tensorstore)
+        else:
+            patched.setattr("jaxil.files.writing.os.replace", fail)
+        with pytest.raises(RunFolderError, match=r"No space left.*of frame 1\. Make"):
+            save(checkpoints, 2, replay)
+
+    save(checkpoints, 2, replay)  # there is room again
+    again = make_replay()
+    Checkpoints(tmp_path).restore(ABSTRACT, again)
+    assert_same_replay(replay, again)
+
+
+def test_a_folder_that_was_moved_is_not_made_again(tmp_path):
+    folder, replay = tmp_path / "run", make_replay()
+    folder.mkdir()
+    checkpoints = Checkpoints(folder)
+    save(checkpoints, 1, replay)
+    folder.rename(tmp_path / "moved")
+    with pytest.raises(RunFolderError, match="deleted or moved"):
+        save(checkpoints, 2, replay)
+    assert not folder.exists()
+    assert Checkpoints(tmp_path / "moved").newest() == 1
 
 
 def test_the_learner_alone_can_be_restored(tmp_path):

@@ -18,7 +18,7 @@ from dm_env import specs
 from jaxil import config as jaxil_config
 from jaxil import train
 from jaxil.demonstrations.loading import Demonstrations
-from jaxil.files.metrics import read_csv
+from jaxil.files.tables import read_csv
 from jaxil.training import assembly
 from tests.test_train import InProcessPool
 

@@ -1,6 +1,10 @@
 """A run's folder, also when an older version of the project wrote it."""
 
+import errno
+import fcntl
 import json
+import os
+import time
 
 import pytest
 
@@ -55,8 +59,79 @@ def test_what_was_written_is_read(tmp_path):
     assert workdir.read_config(tmp_path).to_dict() == config.to_dict()
 
 
-@pytest.mark.parametrize("config", [{}, [], {"method": "pdac"}, {"method": 1}])
-def test_a_damaged_config_is_one_message(tmp_path, config):
-    write(tmp_path, config)
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(json.dumps({"config": c}) for c in ({}, [], {"method": "pdac"})),
+        *('{"config": {"method": 1}}', "", "[" * 200_000, b"\xff"),
+    ],
+)
+def test_a_damaged_config_is_one_message(tmp_path, content):
+    content = content if isinstance(content, bytes) else content.encode()
+    (tmp_path / "config.json").write_bytes(content)
     with pytest.raises(UsageError, match="is damaged"):
         workdir.read_config(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (None, "missing or empty"),
+        ("", "missing or empty"),
+        ("runs/" + "ä" * 128, "256 bytes: expected at most 255"),
+        ("runs/\udcff", "not UTF-8"),
+        ("runs/a\0b", "none of them zero"),
+    ],
+)
+def test_a_folder_that_cannot_be_is_refused(value, said):
+    with pytest.raises(UsageError, match=said) as caught:
+        workdir.from_flag(value)
+    assert "\n" not in str(caught.value)
+    str(caught.value).encode()
+
+
+def test_the_longest_name_will_do(tmp_path):
+    path = workdir.from_flag(str(tmp_path / ("x" * 255)))
+    with workdir.opened(path):
+        workdir.write_config(
+            path, jaxil_config.default_config("pdac", "walker_run"), {}
+        )
+
+
+def test_an_open_folder_is_in_use(tmp_path):
+    with workdir.opened(tmp_path):
+        match = "in use by another process; wait for it"
+        with pytest.raises(UsageError, match=match), workdir.opened(tmp_path):
+            pass
+    with workdir.opened(tmp_path):
+        pass
+
+
+def test_a_file_system_without_locks_will_do(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with workdir.opened(tmp_path):
+        match = f"in use by process {os.getpid()} on"
+        with pytest.raises(UsageError, match=match), workdir.opened(tmp_path):
+            pass
+
+
+def test_leftovers_of_killed_processes_are_removed_at_the_start(tmp_path):
+    left = ["config.json.12.tmp", ".tmp-12-eval.csv", "videos/.frame_1.ab.tmp.mp4"]
+    (tmp_path / "videos").mkdir()
+    for name in left:
+        (tmp_path / name).write_text("")
+        before = time.time() - 100
+        os.utime(tmp_path / name, (before, before))
+    with workdir.opened(tmp_path):
+        assert not any((tmp_path / name).exists() for name in left)
+
+
+def test_a_folder_that_cannot_be_written_is_one_message(tmp_path):
+    (tmp_path / "file").write_text("")
+    folder = tmp_path / "file"
+    with pytest.raises(UsageError, match="not writable"), workdir.opened(folder):
+        pass
+    assert workdir.newest_checkpoint(folder) is None

@@ -1,0 +1,170 @@
+"""The learner's arrays in a folder, by orbax, with a record and checksums.
+
+learner/         arrays by name, such as actor.params.trunk.kernel
+record           JSON: shapes and types of the arrays, and what else is needed
+checksums.json   CRC-32 of each file
+"""
+
+import json
+import pathlib
+import zlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+_FORMAT = 1
+_CHECKSUMS = "checksums.json"
+
+
+class OtherLearnerError(ValueError):
+    """The arrays are those of another learner; the message lists what differs."""
+
+
+def write(
+    folder: pathlib.Path,
+    learner_state: Any,
+    record: dict,
+    arrays: dict[str, np.ndarray],
+) -> None:
+    """Writes a folder, which must not exist.
+
+    Args:
+      folder: absolute.
+      learner_state: pytree of arrays, numbers, typed PRNG keys and None.
+      record: anything that JSON can hold.
+      arrays: others, each for a file NAME.npy.
+
+    Raises:
+      OSError: if a file cannot be written.
+    """
+    import orbax.checkpoint as ocp  # slow to import
+
+    stored, leaves = {}, {}
+    for name, leaf in _named_leaves(learner_state):
+        key_type = None
+        dtype = getattr(leaf, "dtype", None)
+        if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):
+            key_type = str(jax.random.key_impl(leaf))
+            leaf = jax.random.key_data(leaf)
+        array = np.asarray(leaf)
+        # orbax writes no empty arrays; the shape in the record says all of them.
+        if array.size:
+            stored[name] = array
+        leaves[name] = {
+            "shape": list(array.shape),
+            "dtype": str(array.dtype),
+            "key_type": key_type,
+        }
+    record = {**record, "format": _FORMAT, "leaves": leaves}
+    try:
+        with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
+            checkpointer.save(
+                folder,
+                args=ocp.args.Composite(
+                    learner=ocp.args.PyTreeSave(stored),
+                    record=ocp.args.JsonSave(record),
+                ),
+            )
+    except ValueError as error:  # tensorstore's, such as on a full disk
+        raise OSError(_one_line(error)) from error
+    for name, array in arrays.items():
+        np.save(folder / f"{name}.npy", array)
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    names = sorted(path.relative_to(folder).as_posix() for path in files)
+    (folder / _CHECKSUMS).write_text(json.dumps(_checksums(folder, names)))
+
+
+def read(folder: pathlib.Path) -> tuple[dict, dict[str, np.ndarray]]:
+    """Reads the record and the learner's arrays by name, those of keys as numbers.
+
+    Raises:
+      ValueError: a file is missing, or not as it was written.
+    """
+    import orbax.checkpoint as ocp
+
+    try:
+        # Before orbax sees it: on a damaged file, orbax leaves tracebacks of its
+        # threads on the screen, and a change within an array passes unnoticed. Files
+        # that were not there then, such as a file manager's, do not matter.
+        expected = json.loads((folder / _CHECKSUMS).read_text())
+        if not expected or _checksums(folder, expected) != expected:
+            raise ValueError("its files are not as they were written")
+        with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
+            restored = checkpointer.restore(
+                folder,
+                args=ocp.args.Composite(
+                    learner=ocp.args.PyTreeRestore(), record=ocp.args.JsonRestore()
+                ),
+            )
+        arrays = {}
+        for name, leaf in restored.record["leaves"].items():
+            array = np.asarray(restored.learner.get(name, ()), leaf["dtype"])
+            arrays[name] = array.reshape(leaf["shape"])
+    except Exception as error:  # orbax and tensorstore raise whatever they meet
+        raise ValueError(_one_line(error)) from error
+    return restored.record, arrays
+
+
+def as_state(abstract_state: Any, record: dict, arrays: dict[str, np.ndarray]) -> Any:
+    """Returns the learner state that `write` was given.
+
+    Args:
+      abstract_state: pytree of the same structure; its leaves (arrays, or what
+        jax.eval_shape returns) say shapes, dtypes and types.
+      record: see `read`.
+      arrays: see `read`.
+
+    Raises:
+      OtherLearnerError: names, shapes or types differ.
+    """
+    expected = dict(_named_leaves(abstract_state))
+    faults = [f"{name} is missing" for name in expected if name not in arrays]
+    faults += [f"{name} is unknown" for name in arrays if name not in expected]
+    leaves = []
+    for name, like in expected.items():
+        if name in arrays:
+            key_type = record["leaves"][name]["key_type"]
+            leaf = _as_leaf(arrays[name], key_type, like)
+            if _kind(leaf) != _kind(like):
+                faults.append(f"{name} is {_kind(leaf)}, expected {_kind(like)}")
+            leaves.append(leaf)
+    if faults:
+        more = f" and {len(faults) - 5} more" if len(faults) > 5 else ""
+        raise OtherLearnerError("; ".join(faults[:5]) + more)
+    return jax.tree.unflatten(jax.tree.structure(abstract_state), leaves)
+
+
+def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
+    """Lists the leaves with a name each, like actor.params.trunk.kernel."""
+    return [
+        (jax.tree_util.keystr(path, simple=True, separator="."), leaf)
+        for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]
+    ]
+
+
+def _as_leaf(array: np.ndarray, key_type: str | None, like: Any) -> Any:
+    if isinstance(like, bool | int | float):
+        return array.item()
+    if isinstance(like, np.ndarray | np.generic):
+        return array
+    if key_type is not None:
+        return jax.random.wrap_key_data(jnp.asarray(array), impl=key_type)
+    # A copy, because the learner donates its state: jax must own this memory.
+    return jnp.array(array, copy=True)
+
+
+def _kind(leaf: Any) -> str:
+    if isinstance(leaf, bool | int | float):
+        return type(leaf).__name__
+    return f"{leaf.dtype}{list(leaf.shape)}"
+
+
+def _checksums(folder: pathlib.Path, names: list[str]) -> dict[str, int]:
+    return {name: zlib.crc32((folder / name).read_bytes()) for name in names}
+
+
+def _one_line(error: Exception) -> str:
+    first = next(iter(str(error).strip().splitlines()), "")
+    return f"{type(error).__name__}: {first[:160]}" if first else type(error).__name__
