@@ -9,6 +9,7 @@ from PIL import Image, ImageDraw
 from jaxil.demonstrations import foreign, rendering, states
 from jaxil.demonstrations.readers.recording import PixelEpisode, Recording
 from jaxil.environments import suite
+from jaxil.files.untrusted import printable
 
 NUM_COLUMNS = 8  # pictures of an episode on the sheet
 _NUM_ROWS = 10  # episodes on the sheet
@@ -63,7 +64,8 @@ def inspect(
 
     Args:
       path: file or folder of any format in `foreign.FORMATS`.
-      image_size: of pictures drawn from states.
+      image_size: of images rendered from states; videos with larger frames are shrunk
+        until their shorter side has this size.
       render_quality: likewise.
       max_bytes: the largest array that may be unpacked.
 
@@ -74,7 +76,9 @@ def inspect(
     """
     if states.recognises(path):
         return _inspect_states(path, image_size, render_quality)
-    recording = foreign.open_recording(path, max_bytes=max_bytes)
+    recording = foreign.open_recording(
+        path, max_bytes=max_bytes, image_size=image_size, keep_aspect=True
+    )
     speed = recording.frames_per_second
     summaries, pictures, video = [], [], np.empty((0, 1, 1, 3), np.uint8)
     for episode in recording.episodes:
@@ -131,7 +135,7 @@ def render_recording(
 def table(inspection: Inspection) -> str:
     """Returns the inspection as text of a few lines, one for each episode."""
     lines = [f"format: {inspection.kind}"]
-    lines += [f"{label}: {text}" for label, text in inspection.facts.items()]
+    lines += [f"{name}: {printable(text)}" for name, text in inspection.facts.items()]
     returns = [
         summary.task_return
         for summary in inspection.episodes
@@ -235,10 +239,11 @@ def _draw(
 
 
 def _summary(episode: PixelEpisode) -> EpisodeSummary:
+    height, width = episode.stored_size or episode.frames.shape[1:3]
     return EpisodeSummary(
         num_frames=len(episode.frames),
-        height=episode.frames.shape[1],
-        width=episode.frames.shape[2],
+        height=height,
+        width=width,
         action_dim=None if episode.actions is None else episode.actions.shape[1],
         task_return=None if episode.rewards is None else float(episode.rewards.sum()),
     )

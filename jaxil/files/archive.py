@@ -14,6 +14,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from jaxil.files.untrusted import require_regular
+
 MAX_MEMBER_BYTES = 2 * 1024**3
 # What zipfile raises for bytes that are not as they should be.
 _DAMAGES = (
@@ -36,6 +38,7 @@ _HEADER = re.compile(
 def member_names(path: pathlib.Path) -> frozenset[str]:
     """Returns the names of an archive's arrays; none if it is no archive."""
     try:
+        require_regular(path)
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
     except (OSError, ValueError, *_DAMAGES):
@@ -61,6 +64,7 @@ def read_archive(
       ValueError: says what is wrong with it, as the end of a sentence that begins
         with the file's name.
     """
+    require_regular(path)
     try:
         with zipfile.ZipFile(path) as archive:
             stored = {info.filename: info for info in archive.infolist()}
