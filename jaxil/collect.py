@@ -152,10 +152,11 @@ def _convert(values: flags.FlagValues) -> None:
             )
         else:
             recording = foreign.open_recording(
-                path, max_bytes=_max_bytes(), frame_skip=values.frame_skip
+                path,
+                max_bytes=_max_bytes(),
+                frame_skip=values.frame_skip,
+                image_size=values.image_size,
             )
-            if values.image_size is not None:
-                recording = foreign.of_size(recording, values.image_size)
         own.write_pixels(output, recording, origin=f"{recording.kind}, {path.name}")
     print(
         f"{output}: {recording.num_episodes} episodes of {recording.kind}, "

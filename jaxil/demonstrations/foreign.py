@@ -1,21 +1,32 @@
 """Foreign files of pixels, as episodes of the size that the agent sees."""
 
+import itertools
 import pathlib
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image
 
 from jaxil.demonstrations.readers import lerobot, minari, own, pickles, replays, videos
-from jaxil.demonstrations.readers.recording import FormatError, PixelEpisode, Recording
-from jaxil.demonstrations.readers.validation import check_episode
+from jaxil.demonstrations.readers.frames import resized
+from jaxil.demonstrations.readers.recording import (
+    FormatError,
+    PixelEpisode,
+    ReadOptions,
+    Recording,
+    checked,
+)
+from jaxil.demonstrations.readers.sandbox import read_in_child
+from jaxil.files.untrusted import printable, require_regular
 
 # Asked in this order; each decides by content. Videos last: other datasets hold some.
 _READERS: tuple[Any, ...] = (own, pickles, minari, lerobot, replays, videos)
+# Parsed in Python, which cannot crash, and checked before anything is unpacked.
+_READ_HERE = (own, replays)
 FORMATS = (
     "jaxil states or pixels (.npz), ROT or PatchAIL pickles, folders of DrQ-v2 or "
-    "V-D4RL episodes (.npz), videos (mp4, gif, webm), Minari and LeRobot v3 datasets"
+    "V-D4RL episodes (.npz), videos (mp4, mov, gif, webm, mkv, avi), Minari datasets, "
+    "LeRobot v3 datasets"
 )
 
 
@@ -40,33 +51,56 @@ class PixelEpisodes(NamedTuple):
 
 
 def open_recording(
-    path: pathlib.Path, *, max_bytes: int, frame_skip: int = 1
+    path: pathlib.Path,
+    *,
+    max_bytes: int,
+    frame_skip: int = 1,
+    image_size: int | None = None,
+    keep_aspect: bool = False,
 ) -> Recording:
     """Opens a file or folder of any known format, decided by content.
 
     Args:
       path: what to open.
       max_bytes: the largest array that may be unpacked.
-      frame_skip: every so many-th frame is kept, and the rewards between are summed.
+      frame_skip: every n-th frame is kept, and the rewards between are summed.
+      image_size: height and width of the frames; None for those in the file. Videos are
+        scaled while they are decoded, so that their size and length need no memory.
+      keep_aspect: of videos, `image_size` is the shorter side and nothing is enlarged;
+        the frames of other formats are left as they are.
 
     Returns:
       The recording, whose episodes are checked as they are read.
 
     Raises:
       FormatError: no reader knows it, or it breaks its format's rules.
-      OSError: it can't be opened.
+      OSError: it cannot be opened.
     """
-    path.stat()  # a file that is missing is no question of formats
-    for reader in _READERS:
-        if reader.recognises(path):
-            if reader is videos:  # a long video need not be unpacked whole
-                recording = reader.open_recording(
-                    path, max_bytes=max_bytes, frame_skip=frame_skip
-                )
-                return recording._replace(episodes=_checked(recording, frame_skip=1))
-            recording = reader.open_recording(path, max_bytes=max_bytes)
-            return _skipping(recording, frame_skip)
-    raise FormatError(f"is cut off, damaged, or in no format that is read: {FORMATS}")
+    try:
+        require_regular(path, or_folder=True)
+    except ValueError as error:
+        raise FormatError(str(error)) from error
+    reader = next((reader for reader in _READERS if reader.recognises(path)), None)
+    if reader is None:
+        raise FormatError(
+            f"is cut off, damaged, or in no format that is read: {FORMATS}"
+        )
+    options = ReadOptions(max_bytes, frame_skip, image_size, keep_aspect)
+    if reader in _READ_HERE:
+        items = checked(reader.read(path, options))
+    else:
+        items = read_in_child(reader.read, path, options)
+    recording = next(items)
+    repeat, speed = recording.action_repeat, recording.frames_per_second
+    if reader is videos:  # which skips frames while it decodes them
+        frame_skip = 1
+    return recording._replace(
+        episodes=_fitted(items, frame_skip, None if keep_aspect else image_size),
+        task=recording.task and printable(recording.task),
+        action_repeat=repeat and repeat * frame_skip,
+        frames_per_second=speed and speed / frame_skip,
+        notes=tuple(printable(note, 200) for note in recording.notes),
+    )
 
 
 def read_episodes(
@@ -82,33 +116,31 @@ def read_episodes(
     Args:
       path: file or folder.
       num_episodes: how many.
-      image_size: height and width wanted, in pixels.
-      frame_skip: every so many-th frame is kept.
+      image_size: height and width of the result, in pixels.
+      frame_skip: every n-th frame is kept.
       max_bytes: the memory that the result, and each array on the way, may take.
 
     Raises:
       FormatError: see `open_recording`; or it holds fewer episodes, or too much.
-      OSError: it can't be opened.
+      OSError: it cannot be opened.
     """
-    recording = open_recording(path, max_bytes=max_bytes, frame_skip=frame_skip)
+    recording = open_recording(
+        path, max_bytes=max_bytes, frame_skip=frame_skip, image_size=image_size
+    )
     if num_episodes > recording.num_episodes:
         raise FormatError(
             f"holds {recording.num_episodes} episodes, and "
             f"num_episodes={num_episodes} were asked for"
         )
-    episodes, stored_size, num_bytes = [], (0, 0), 0
-    for index, episode in enumerate(recording.episodes):
-        if index == num_episodes:
-            break
-        if index == 0:
-            stored_size = episode.frames.shape[1:3]
-        num_bytes += len(episode.frames) * image_size * image_size * 3
+    episodes, num_bytes = [], 0
+    for episode in itertools.islice(recording.episodes, num_episodes):
+        episodes.append(episode)
+        num_bytes += episode.frames.nbytes
         if num_bytes > max_bytes:
             raise FormatError(
-                f"needs more than {max_bytes} bytes for {index + 1} episodes at "
+                f"needs more than {max_bytes} bytes for {len(episodes)} episodes at "
                 f"{image_size}x{image_size} pixels, which is more than can be spared"
             )
-        episodes.append(episode._replace(frames=resized(episode.frames, image_size)))
     if len(episodes) < num_episodes:
         raise FormatError(f"ends after {len(episodes)} of {num_episodes} episodes")
     return PixelEpisodes(
@@ -117,68 +149,32 @@ def read_episodes(
         np.array([len(episode.frames) for episode in episodes]),
         _together("actions", [episode.actions for episode in episodes]),
         _together("rewards", [episode.rewards for episode in episodes]),
-        stored_size,
+        episodes[0].stored_size or (image_size, image_size),
     )
 
 
-def resized(frames: np.ndarray, size: int) -> np.ndarray:
-    """Returns frames [N, size, size, 3] of frames [N, H, W, 3], with antialiasing.
-
-    Pictures that are not square are squeezed into one. Frames that have the size
-    already are returned as they are.
-    """
-    if frames.shape[1:3] == (size, size):
-        return frames
-    # Pillow's bilinear filter grows with the scale, so nothing is skipped over.
-    return np.stack(
-        [
-            np.asarray(
-                Image.fromarray(frame).resize((size, size), Image.Resampling.BILINEAR)
+def _fitted(
+    items: Iterator[PixelEpisode | None], frame_skip: int, image_size: int | None
+) -> Iterator[PixelEpisode]:
+    """Yields a reader's episodes with frames skipped, and the others resized."""
+    for index, episode in enumerate(item for item in items if item is not None):
+        frames, actions, rewards, stored_size = episode
+        num_steps = (len(frames) - 1) // frame_skip
+        if num_steps < 1:
+            raise FormatError(
+                f"has {len(frames)} frames in episode {index}, too few for "
+                f"frame_skip={frame_skip}"
             )
-            for frame in frames
-        ]
-    )
-
-
-def of_size(recording: Recording, image_size: int) -> Recording:
-    """Returns the recording with its frames resized as they are read."""
-
-    def episodes() -> Iterator[PixelEpisode]:
-        for episode in recording.episodes:
-            yield episode._replace(frames=resized(episode.frames, image_size))
-
-    return recording._replace(episodes=episodes())
-
-
-def _checked(recording: Recording, *, frame_skip: int) -> Iterator[PixelEpisode]:
-    for index, episode in enumerate(recording.episodes):
-        check_episode(index, episode)
-        if frame_skip > 1:
-            num_steps = (len(episode.frames) - 1) // frame_skip
-            if num_steps < 1:
-                raise FormatError(
-                    f"has {len(episode.frames)} frames in episode {index}, too few for "
-                    f"frame_skip={frame_skip}"
-                )
-            used = num_steps * frame_skip
-            actions, rewards = episode.actions, episode.rewards
-            episode = PixelEpisode(
-                episode.frames[: used + 1 : frame_skip],
-                None if actions is None else actions[:used:frame_skip],
-                None
-                if rewards is None
-                else rewards[:used].reshape(num_steps, frame_skip).sum(axis=1),
-            )
-        yield episode
-
-
-def _skipping(recording: Recording, frame_skip: int) -> Recording:
-    repeat, speed = recording.action_repeat, recording.frames_per_second
-    return recording._replace(
-        episodes=_checked(recording, frame_skip=frame_skip),
-        action_repeat=None if repeat is None else repeat * frame_skip,
-        frames_per_second=None if speed is None else speed / frame_skip,
-    )
+        used = num_steps * frame_skip
+        frames = frames[: used + 1 : frame_skip]
+        if actions is not None:
+            actions = actions[:used:frame_skip]
+        if rewards is not None and frame_skip > 1:
+            rewards = rewards[:used].reshape(num_steps, frame_skip).sum(axis=1)
+        height, width = stored_size or frames.shape[1:3]
+        if image_size is not None and frames.shape[1:3] != (image_size, image_size):
+            frames = np.stack([resized(x, (image_size, image_size)) for x in frames])
+        yield PixelEpisode(frames, actions, rewards, (height, width))
 
 
 def _together(name: str, values: list[np.ndarray | None]) -> np.ndarray | None:

@@ -11,6 +11,7 @@ from PIL import Image, ImageDraw
 from jaxil.demonstrations import foreign, rendering, states
 from jaxil.demonstrations.readers.recording import PixelEpisode, Recording
 from jaxil.environments import suite
+from jaxil.files.untrusted import printable
 
 NUM_COLUMNS = 8  # pictures of an episode on the sheet
 _NUM_ROWS = 10  # episodes on the sheet
@@ -60,7 +61,8 @@ def inspect(path: pathlib.Path, *, max_bytes: int, **view: Any) -> Inspection:
     Args:
       path: file or folder of any format in `foreign.FORMATS`.
       max_bytes: the largest array that may be unpacked.
-      view: `image_size` and `render_quality` of images rendered from states.
+      view: `image_size` and `render_quality` of images rendered from states; videos are
+        shrunk until their shorter side has that size.
 
     Raises:
       DemonstrationError: a file of states is damaged.
@@ -70,11 +72,14 @@ def inspect(path: pathlib.Path, *, max_bytes: int, **view: Any) -> Inspection:
     """
     if states.recognises(path):
         return _inspect_states(path, view)
-    recording = foreign.open_recording(path, max_bytes=max_bytes)
+    recording = foreign.open_recording(
+        path, max_bytes=max_bytes, image_size=view["image_size"], keep_aspect=True
+    )
     speed = recording.frames_per_second
     summaries, pictures, video = [], [], np.empty((0, 1, 1, 3), np.uint8)
     for episode in recording.episodes:
-        frames, actions, rewards = episode
+        frames, actions, rewards = episode.frames, episode.actions, episode.rewards
+        height, width = episode.stored_size or frames.shape[1:3]
         if len(pictures) < _NUM_ROWS:
             pictures.append(frames[spaced(len(frames))].copy())
         if not summaries:
@@ -82,7 +87,7 @@ def inspect(path: pathlib.Path, *, max_bytes: int, **view: Any) -> Inspection:
         summaries.append(
             EpisodeSummary(
                 len(frames),
-                f"{frames.shape[2]}x{frames.shape[1]}",
+                f"{width}x{height}",
                 None if actions is None else actions.shape[1],
                 None if rewards is None else float(rewards.sum()),
             )
@@ -155,7 +160,7 @@ def render_recording(path: pathlib.Path, **view: Any) -> Recording:
 
 def table(inspection: Inspection) -> str:
     """Returns the inspection as text, with one line for each episode."""
-    lines = [f"{label}: {text}" for label, text in inspection.facts.items()]
+    lines = [f"{name}: {printable(text)}" for name, text in inspection.facts.items()]
     lines.append(f"episodes: {len(inspection.episodes)}")
     known = [row.task_return for row in inspection.episodes]
     if returns := [value for value in known if value is not None]:

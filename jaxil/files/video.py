@@ -1,11 +1,11 @@
 """Videos of an episode, the agent beside the expert."""
 
-import contextlib
 import os
 import pathlib
-import subprocess
 import uuid
 from collections.abc import Iterator
+from fractions import Fraction
+from typing import BinaryIO
 
 import numpy as np
 
@@ -65,45 +65,39 @@ def write_video(
     path = pathlib.Path(path)
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp.mp4")
     try:
-        _encode(temporary, pictures(), size=canvas.shape[:2], fps=fps)
-        os.replace(temporary, path)
+        with temporary.open("wb") as file:
+            _encode(file, pictures(), size=canvas.shape[:2], fps=fps)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
 
 
 def _encode(
-    path: pathlib.Path,
+    file: BinaryIO,
     pictures: Iterator[np.ndarray],
     *,
     size: tuple[int, int],
     fps: float,
 ) -> None:
-    """Pipes pictures [H, W, 3] through ffmpeg into an H.264 file."""
-    import imageio_ffmpeg
+    """Writes pictures [H, W, 3] as an H.264 file that every browser plays."""
+    import av
+    import av.error
 
-    # Its own write_frames runs Python code between fork and exec, which can deadlock a
-    # process that has threads, as one with jax has; a process group does the same: an
-    # interrupt (Ctrl-C) reaches us and not ffmpeg.
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y"]
-    command += ["-f", "rawvideo", "-pix_fmt", "rgb24"]
-    command += ["-s", f"{size[1]}x{size[0]}", "-r", str(fps), "-i", "-"]
-    # Every player understands 4:2:0 colours, which want even sizes.
-    command += ["-c:v", "libx264", "-preset", "veryfast", "-crf", "18"]
-    command += ["-pix_fmt", "yuv420p", "-movflags", "+faststart", str(path)]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, process_group=0
-    ) as process:
-        assert process.stdin is not None
-        assert process.stderr is not None
-        # A broken pipe: ffmpeg has given up, and says why.
-        with contextlib.suppress(BrokenPipeError):
+    rate = Fraction(fps).limit_denominator(60_000)
+    try:
+        with av.open(file, "w", "mp4", options={"movflags": "+faststart"}) as container:
+            stream = container.add_stream(
+                "libx264", rate, options={"preset": "veryfast", "crf": "18"}
+            )
+            stream.height, stream.width = size
+            stream.pix_fmt = "yuv420p"  # which needs even sizes
             for picture in pictures:
-                process.stdin.write(picture.tobytes())
-        with contextlib.suppress(BrokenPipeError):
-            process.stdin.close()
-        said = process.stderr.read().decode(errors="replace").strip()
-    if process.returncode != 0:
-        raise OSError(f"{path.name}: ffmpeg could not write the video: {said}")
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture)))
+            container.mux(stream.encode())
+    except av.error.FFmpegError as error:
+        raise OSError(f"the video could not be encoded: {error}") from error
 
 
 def _canvas(
@@ -115,7 +109,6 @@ def _canvas(
       The background [H', W', 3] with even sides, the upper left corner (row, column) of
       each picture on it, and the whole factor that pictures are enlarged by.
     """
-    # Pillow comes with imageio.
     from PIL import Image, ImageDraw
 
     factor = max(1, -(-_LEAST_HEIGHT // size[0]))

@@ -42,7 +42,7 @@ def read_into(replay: Replay, folder: pathlib.Path, index: int) -> str | None:
         names = Episode._fields
         if _NUMBER in archive.member_names(path):
             names = (*names, _NUMBER)
-        limit = archive.MAX_MEMBER_BYTES
+        limit = archive.MAX_BYTES
         arrays = archive.read_archive(path, max_bytes=dict.fromkeys(names, limit))
         number = arrays.pop(_NUMBER, index)
         if number != index:

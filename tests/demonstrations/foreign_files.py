@@ -4,14 +4,21 @@ import io
 import json
 import pathlib
 import pickle
-import subprocess
+from collections.abc import Sequence
+from fractions import Fraction
+from typing import Any
 
-import imageio_ffmpeg
+import av
 import numpy as np
 from PIL import Image
 
 from jaxil.demonstrations.readers import own
-from jaxil.demonstrations.readers.recording import PixelEpisode, Recording
+from jaxil.demonstrations.readers.recording import (
+    PixelEpisode,
+    ReadOptions,
+    Recording,
+    checked,
+)
 
 CAMERA = "observation.images.front"  # in the datasets of LeRobot
 
@@ -110,8 +117,7 @@ def _write_lerobot_file(path, file, episodes, chosen, as_images, gap) -> None:
     if not as_images:
         video = path / f"videos/{CAMERA}/{name}.mp4"
         video.parent.mkdir(parents=True, exist_ok=True)
-        options = ("-c:v", "libx264rgb", "-qp", "0", "-g", "2")
-        encode_video(video, np.concatenate(frames), *options, fps=10)
+        encode_video(video, np.concatenate(frames), fps=10, g="2")
 
 
 def make_parquet(path: pathlib.Path, rows: list[dict]) -> None:
@@ -183,18 +189,50 @@ def make_minari_dataset(
 def write_video(path: pathlib.Path, seed: int) -> None:
     """An MP4 file of one episode, whose every pixel is kept."""
     frames = _random_frames(np.random.default_rng(seed), num_frames=5)
-    encode_video(path, frames, "-f", "mp4", "-c:v", "libx264rgb", "-qp", "0")
+    encode_video(path, frames, format="mp4")
 
 
 def encode_video(
-    path: pathlib.Path, frames: np.ndarray, *output: str, fps: float | str = 25
+    path: pathlib.Path,
+    frames: np.ndarray,
+    codec: str = "libx264rgb",
+    pixels: str = "rgb24",
+    *,
+    format: str | None = None,
+    fps: Fraction | int = 25,
+    times: Sequence[int] | None = None,
+    container_options: dict[str, str] | None = None,
+    **options: str,
 ) -> None:
-    """Writes frames [T, H, W, 3] by ffmpeg, with these options for its output."""
-    height, width = frames.shape[1:3]
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y"]
-    command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
-    command += ["-r", str(fps), "-i", "-", *output, str(path)]
-    subprocess.run(command, input=frames.tobytes(), check=True, capture_output=True)
+    """Writes frames [T, H, W, 3], without loss unless the options say otherwise."""
+    if codec == "libx264rgb":
+        options = {"qp": "0", **options}
+    options_ = container_options or {}
+    with open_video(path, "w", format=format, options=options_) as container:
+        stream = container.add_stream(codec, Fraction(fps), options=options)
+        stream.height, stream.width = frames.shape[1:3]
+        stream.pix_fmt = pixels
+        for index, picture in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture))
+            frame = frame.reformat(format=pixels)
+            frame.pts = index if times is None else times[index]
+            frame.time_base = 1 / Fraction(fps)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def open_video(path: pathlib.Path, mode: Any = "r", **options: Any) -> Any:
+    """Opens a video by PyAV, whose own types of streams are too many."""
+    return av.open(path, mode, **options)
+
+
+def read_here(reader: Any, path: pathlib.Path, **options: Any):
+    """Returns what a reader's module reads, in this process, which is faster."""
+    items = checked(reader.read(path, ReadOptions(**{"max_bytes": 2**24, **options})))
+    recording = next(items)
+    episodes = [item for item in items if item is not None]
+    assert len(episodes) == recording.num_episodes
+    return recording, episodes
 
 
 def _random_frames(rng: np.random.Generator, num_frames: int, size=8) -> np.ndarray:

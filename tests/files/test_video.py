@@ -1,29 +1,23 @@
 """Videos are opened again with ffmpeg and looked at."""
 
-import re
-import subprocess
-
-import imageio_ffmpeg
 import numpy as np
 import pytest
 
 from jaxil.files.video import write_video
+from tests.demonstrations.foreign_files import open_video
 
 
 def read_video(path) -> tuple[tuple[int, int], float, np.ndarray]:
     """Decodes a video: (width, height), frames per second, frames [T, H, W, 3]."""
-    ffmpeg = imageio_ffmpeg.get_ffmpeg_exe()
-    output = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
-    done = subprocess.run(
-        [ffmpeg, "-i", path, *output], capture_output=True, check=True
-    )
-    stream = re.search(
-        r"Video: h264.* (\d+)x(\d+).* ([\d.]+) fps", done.stderr.decode()
-    )
-    assert stream is not None, done.stderr
-    width, height = int(stream[1]), int(stream[2])
-    frames = np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3)
-    return (width, height), float(stream[3]), frames
+    with open_video(path) as container:
+        stream = container.streams.video[0]
+        assert stream.codec_context.name == "h264"
+        frames = [
+            frame.to_ndarray(format="rgb24") for frame in container.decode(stream)
+        ]
+        assert stream.pix_fmt == "yuv420p"
+        size = stream.width, stream.height
+        return size, float(stream.average_rate), np.stack(frames)
 
 
 def plain_frames(num_frames: int, colour: tuple[int, int, int], size=(84, 84)):
@@ -92,8 +86,24 @@ def test_bad_frames_are_refused(tmp_path, left, right, fps, message):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_failing_encoder_is_told(tmp_path):
-    with pytest.raises(OSError, match="ffmpeg could not write the video"):
+def test_it_begins_to_play_before_all_of_it_is_there(tmp_path):
+    write_video(tmp_path / "video.mp4", plain_frames(40, (0, 0, 0)), fps=12.5)
+    content = (tmp_path / "video.mp4").read_bytes()
+    assert 0 < content.index(b"moov") < content.index(b"mdat")
+    assert read_video(tmp_path / "video.mp4")[1] == 12.5
+
+
+def test_a_folder_that_is_not_there(tmp_path):
+    with pytest.raises(OSError, match="No such file"):
         write_video(
             tmp_path / "missing" / "video.mp4", plain_frames(40, (0, 0, 0)), fps=10
         )
+
+
+def test_a_failing_encoder_leaves_the_old_file(tmp_path):
+    path = tmp_path / "video.mp4"
+    path.write_bytes(b"old")
+    with pytest.raises(OSError, match="could not be encoded"):
+        write_video(path, plain_frames(1, (0, 0, 0), (256, 20_000)), fps=10)
+    assert path.read_bytes() == b"old"
+    assert [item.name for item in tmp_path.iterdir()] == ["video.mp4"]

@@ -1,160 +1,296 @@
-"""LeRobot datasets of version 3: one camera, actions and rewards."""
+"""LeRobot datasets of version 3: one camera, actions and rewards.
 
-import contextlib
-import importlib.util
+LeRobot stores with frame t the action that was taken there, and no frame that shows
+what the last one led to: that action is dropped, and an episode of L frames has L - 1
+steps. `next.reward`, or else `reward`, is what arrived after the action.
+
+Source of the format: huggingface/lerobot, src/lerobot/datasets.
+"""
+
 import itertools
+import os
 import pathlib
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxil.demonstrations.readers import clips, lerobot_file, lerobot_index, messages
-from jaxil.demonstrations.readers.lerobot_index import Dataset, Episode
-from jaxil.demonstrations.readers.recording import FormatError, PixelEpisode, Recording
+from jaxil.demonstrations.readers import videos
+from jaxil.demonstrations.readers.frames import decode_pictures
+from jaxil.demonstrations.readers.recording import (
+    FormatError,
+    Item,
+    PixelEpisode,
+    ReadOptions,
+    Recording,
+    first_bytes,
+    read_json,
+)
+from jaxil.files.untrusted import require_regular
 
-_HEAD_BYTES = 4096  # of meta/info.json, where the key is that tells the format
+_INFO = "meta/info.json"
+_MAX_EPISODES = 1_000_000
+_MAX_FPS = 1e6
 _MAX_RATE_ERROR = 0.001  # of a video's frames per second against the dataset's
 
 
-def recognises(path: pathlib.Path) -> bool:
-    """Tells whether this is the folder of a LeRobot dataset; never raises."""
-    try:
-        if not (path / lerobot_index.INFO).is_file():
-            return False
-        with (path / lerobot_index.INFO).open("rb") as file:
-            return b'"codebase_version"' in file.read(_HEAD_BYTES)
-    except (OSError, ValueError):
-        return False
+class _Dataset(NamedTuple):
+    """What meta/info.json says.
 
-
-def open_recording(path: pathlib.Path, *, max_bytes: int) -> Recording:
-    """Opens a dataset that has exactly one camera.
-
-    LeRobot stores with frame t the action that was taken there, and no frame that shows
-    what the last one led to: that action is dropped, and an episode of L frames has
-    L - 1 steps. `next.reward`, or else `reward`, is what arrived after the action.
-
-    Args:
-      path: the dataset's folder. Nothing outside of it is opened.
-      max_bytes: of one episode's frames.
-
-    Raises:
-      FormatError: it is no such dataset, or pyarrow is not installed.
-      OSError: a file cannot be opened.
+    Attributes:
+      camera: the name of its only camera.
+      is_video: whether its pictures are in videos, or beside the actions.
+      columns: of "actions" and "rewards", those that there are.
+      paths: templates of the paths of "data" and "video".
     """
-    dataset, notes = lerobot_index.read_info(path)
-    if importlib.util.find_spec("pyarrow") is None:
-        raise FormatError("needs pyarrow: pip install 'jaxil[lerobot]'")
-    episodes = lerobot_index.find_episodes(dataset, max_bytes)
-    return Recording(
-        kind="LeRobot dataset",
-        num_episodes=len(episodes),
-        episodes=_read_episodes(dataset, episodes, max_bytes),
-        frames_per_second=dataset.fps,
-        notes=notes,
+
+    root: pathlib.Path
+    fps: float
+    num_episodes: int
+    camera: str
+    is_video: bool
+    columns: dict[str, str]
+    paths: dict[str, Any]
+
+
+class _Episode(NamedTuple):
+    """Where an episode is; it begins `start_seconds` after its video does."""
+
+    index: int
+    length_frames: int
+    data: pathlib.Path
+    video: pathlib.Path | None
+    start_seconds: float
+
+
+def recognises(path: pathlib.Path) -> bool:
+    """Tells whether this is the folder of a LeRobot dataset."""
+    return b'"codebase_version"' in first_bytes(path / _INFO, 4096)
+
+
+def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
+    """Reads a dataset that has exactly one camera; see `recording`.
+
+    Nothing outside of its folder is opened.
+    """
+    dataset = _read_info(path)
+    try:
+        import pyarrow  # noqa: F401
+    except ImportError:
+        raise FormatError("needs pyarrow: pip install 'jaxil[lerobot]'") from None
+    episodes = _find_episodes(dataset)
+    notes = ()
+    if "actions" not in dataset.columns:
+        notes = ("Its actions are no real numbers, and not read.",)
+    fps = dataset.fps
+    yield Recording(
+        "LeRobot dataset", len(episodes), frames_per_second=fps, notes=notes
     )
-
-
-def _read_episodes(
-    dataset: Dataset, episodes: Sequence[Episode], max_bytes: int
-) -> Iterator[PixelEpisode]:
-    rows = _rows(dataset, episodes, max_bytes)
-    videos = _videos(dataset, episodes, max_bytes) if dataset.is_video else None
-    # Each holds a running program, which ends with it.
-    with contextlib.closing(rows), contextlib.closing(videos or rows):
-        for episode in episodes:
-            values = next(rows)
-            frames = values.pop("frames") if videos is None else next(videos)
-            for name, array in values.items():
-                if len(array) != episode.length:
-                    raise FormatError(
-                        f"has {len(array)} {name} in episode {episode.index}, where "
-                        f"{episode.length} belong"
-                    )
-            yield PixelEpisode(
-                frames, **{name: array[:-1] for name, array in values.items()}
+    rows = _rows(dataset, episodes, options)
+    videos_ = _video_frames(dataset, episodes, options) if dataset.is_video else None
+    for episode in episodes:
+        values = next(rows)
+        if videos_ is None:
+            yield PixelEpisode(stored_size=None, **values)
+            continue
+        while (shown := next(videos_)) is None:
+            yield None
+        if len(shown.frames) != episode.length_frames:
+            raise FormatError(
+                f"has a video that ends after {len(shown.frames)} of the "
+                f"{episode.length_frames} frames of episode {episode.index}"
             )
+        yield shown._replace(**values)
+
+
+def _read_info(root: pathlib.Path) -> _Dataset:
+    """Returns what the dataset says of itself, checked."""
+    info = read_json(_inside(root, _INFO))
+    version, features = info.get("codebase_version"), info.get("features")
+    if not str(version).startswith("v3."):
+        raise FormatError(
+            f"has codebase_version {version!r:.50}; only v3 can be read, to which "
+            "LeRobot converts older ones"
+        )
+    for name, kind, most in (
+        ("fps", int | float, _MAX_FPS),
+        ("total_episodes", int, _MAX_EPISODES),
+    ):
+        if not isinstance(info.get(name), kind) or not 0 < info[name] <= most:
+            raise FormatError(f"has {name}={info.get(name)!r:.50} in {_INFO}")
+    if not isinstance(features, dict):
+        raise FormatError(f"has no features in {_INFO}")
+    kinds = {
+        name: feature.get("dtype") if isinstance(feature, dict) else None
+        for name, feature in features.items()
+    }
+    cameras = [name for name, kind in kinds.items() if kind in ("video", "image")]
+    if len(cameras) != 1:
+        raise FormatError(f"has {len(cameras)} cameras, not one: {', '.join(cameras)}")
+    is_video = kinds[cameras[0]] == "video"
+    paths = {name: info.get(f"{name}_path") for name in ("data", "video")}
+    for name in paths if is_video else ("data",):
+        if not isinstance(paths[name], str):
+            raise FormatError(f"has no {name}_path in {_INFO}")
+    columns = {}
+    if kinds.get("action") in ("float32", "float64"):
+        columns["actions"] = "action"
+    for name in ("reward", "next.reward"):  # the last one that is there counts
+        if name in kinds:
+            columns["rewards"] = name
+    fps, num_episodes = float(info["fps"]), info["total_episodes"]
+    return _Dataset(root, fps, num_episodes, cameras[0], is_video, columns, paths)
+
+
+def _find_episodes(dataset: _Dataset) -> list[_Episode]:
+    """Reads where all episodes are."""
+    video = f"videos/{dataset.camera}/"
+    names = ["episode_index", "length", "data/chunk_index", "data/file_index"]
+    if dataset.is_video:
+        names += [f"{video}chunk_index", f"{video}file_index", f"{video}from_timestamp"]
+    rows = []
+    for file in sorted(dataset.root.glob("meta/episodes/*/*.parquet")):
+        file = _inside(dataset.root, file.relative_to(dataset.root).as_posix())
+        rows += _read_table(file, names).to_pylist()
+    episodes = []
+    for row in rows:
+        *integers, start = [*row.values(), 0.0][: len(names) | 1]
+        is_known = all(isinstance(value, int) for value in integers)
+        if not is_known or not isinstance(start, float) or not 0 <= start < 1e9:
+            raise FormatError(f"has an episode at an impossible place: {row}")
+        index, length, *places = integers
+        if length < 2:
+            raise FormatError(f"has {length} frames in episode {index}; 2 are needed")
+        data = _file(dataset, "data", *places[:2])
+        shown_in = _file(dataset, "video", *places[2:]) if dataset.is_video else None
+        episodes.append(_Episode(index, length, data, shown_in, start))
+    episodes.sort()
+    if [episode.index for episode in episodes] != list(range(dataset.num_episodes)):
+        raise FormatError(
+            f"has {len(rows)} episodes in meta/episodes, which are not those from 0 to "
+            f"{dataset.num_episodes - 1}"
+        )
+    return episodes
 
 
 def _rows(
-    dataset: Dataset, episodes: Sequence[Episode], max_bytes: int
-) -> Generator[dict[str, np.ndarray], None, None]:
-    """Yields actions [L, A] and rewards [L] of each episode, and frames if there."""
+    dataset: _Dataset, episodes: Sequence[_Episode], options: ReadOptions
+) -> Iterator[dict[str, np.ndarray]]:
+    """Yields the fields of a PixelEpisode that are in the Parquet files."""
+    names = ["episode_index", "frame_index", *dataset.columns.values()]
+    if not dataset.is_video:
+        names.append(dataset.camera)
     for file, group in itertools.groupby(episodes, lambda episode: episode.data):
-        child = messages.open_child(
-            lerobot_file.__name__,
-            file,
-            max_bytes=max_bytes,
-            columns=["frame_index", *dataset.columns],
-            image=None if dataset.is_video else dataset.camera,
-            split="episode_index",
-        )
-        with child:
-            for episode in group:
-                message = messages.receive(child, max_bytes=max_bytes)
-                arrays = dict(message.arrays)
-                times = arrays.pop("frame_index")
-                if message.facts["value"] != episode.index or not np.array_equal(
-                    times, np.arange(episode.length)
-                ):
-                    raise FormatError(
-                        f"has other rows in {file.name} than the {episode.length} of "
-                        f"episode {episode.index}"
-                    )
-                values = {"frames": arrays["frames"]} if "frames" in arrays else {}
-                with np.errstate(all="ignore"):  # too large a number becomes infinite
-                    for column, name in dataset.columns.items():
-                        values[name] = arrays[column].astype(np.float32)
-                if values.get("actions", np.empty((0, 0))).ndim == 1:
-                    values["actions"] = values["actions"][:, None]
-                if "rewards" in values:
-                    values["rewards"] = values["rewards"].reshape(-1)
-                yield values
+        table = _read_table(file, names)
+        indices = _numbers(table, "episode_index")
+        for episode in group:
+            (places,) = np.nonzero(indices == episode.index)
+            rows = table.take(places)
+            options.check_bytes(f"rows of episode {episode.index}", rows.nbytes)
+            times = np.arange(episode.length_frames)
+            if not np.array_equal(_numbers(rows, "frame_index"), times):
+                raise FormatError(
+                    f"has other rows in {file.name} than the {len(times)} of episode "
+                    f"{episode.index}"
+                )
+            values = {
+                name: _numbers(rows, column)[:-1]
+                for name, column in dataset.columns.items()
+            }
+            if "actions" in values:
+                values["actions"] = values["actions"].reshape(len(times) - 1, -1)
+            if not dataset.is_video:
+                files = rows[dataset.camera].to_pylist()
+                values["frames"] = decode_pictures(_contents(files), options)
+            yield values
 
 
-def _videos(
-    dataset: Dataset, episodes: Sequence[Episode], max_bytes: int
-) -> Generator[np.ndarray, None, None]:
-    """Yields the frames of each episode, uint8 [L, H, W, 3]."""
+def _video_frames(
+    dataset: _Dataset, episodes: Sequence[_Episode], options: ReadOptions
+) -> Iterator[PixelEpisode | None]:
+    """Yields each episode's frames, and None after some of them."""
+    options = options._replace(frame_skip=1)
     for file, group in itertools.groupby(episodes, lambda episode: episode.video):
         assert file is not None
-        clip = clips.probe(file)
-        rate = clip.frames_per_second or 0.0
-        if not clip.is_even or abs(rate / dataset.fps - 1) > _MAX_RATE_ERROR:
+        rate, is_even = videos.timing(file)
+        if not rate or not is_even or abs(rate / dataset.fps - 1) > _MAX_RATE_ERROR:
             raise FormatError(
-                f"has a video {file.name} of {rate:.4g} frames per second, where "
-                f"{lerobot_index.INFO} says {dataset.fps:.4g}"
+                f"has a video {file.name} of {rate or 0:.4g} frames per second, where "
+                f"{_INFO} says {dataset.fps:.4g}"
             )
-        seconds = clips.cpu_seconds_for(clip, file.stat().st_size)
-        decoded = clips.decode(file, max_frame_bytes=max_bytes, cpu_seconds=seconds)
-        num_seen = 0
-        with contextlib.closing(decoded):
-            for episode in group:
-                skipped = round(episode.start_seconds * rate) - num_seen
-                if skipped < 0:
-                    raise FormatError(
-                        f"has an episode {episode.index} that begins in the one before"
-                    )
-                num_seen += skipped + episode.length
-                frames = itertools.islice(decoded, skipped, skipped + episode.length)
-                yield _stack(episode, frames, max_bytes)
+        decoded, num_seen = videos.decode(file, options), 0
+        for episode in group:
+            skipped = round(episode.start_seconds * rate) - num_seen
+            if skipped < 0:
+                raise FormatError(
+                    f"has an episode {episode.index} that begins in the one before"
+                )
+            for _ in itertools.islice(decoded, skipped):
+                yield None
+            num_seen += skipped + episode.length_frames
+            own = itertools.islice(decoded, episode.length_frames)
+            yield from videos.collect(own, options)
 
 
-def _stack(
-    episode: Episode, frames: Iterator[np.ndarray], max_bytes: int
-) -> np.ndarray:
-    """Returns an episode's frames in one array."""
-    stacked, count = np.empty(0, np.uint8), 0
-    for frame in frames:
-        if not count:
-            height, width, _ = frame.shape
-            clips.check_size(episode.length, height, width, max_bytes)
-            stacked = np.empty((episode.length, *frame.shape), np.uint8)
-        stacked[count] = frame
-        count += 1
-    if count != episode.length:
+def _read_table(file: pathlib.Path, names: Sequence[str]) -> Any:
+    """Returns columns of a Parquet file."""
+    from pyarrow import parquet
+
+    require_regular(file)
+    with file.open("rb") as opened, parquet.ParquetFile(opened) as content:
+        missing = [name for name in names if name not in content.schema_arrow.names]
+        if missing:
+            raise FormatError(f"has no column {', '.join(missing)} in {file.name}")
+        return content.read(columns=list(names), use_threads=False).select(names)
+
+
+def _numbers(table: Any, name: str) -> np.ndarray:
+    """Returns a column of numbers, or of equally many of them in each row."""
+    try:
+        values = np.array(table[name].to_pylist())
+    except ValueError as error:
+        raise FormatError(f"has rows of unequal lengths in {name}") from error
+    if values.dtype.kind not in "biuf":
+        raise FormatError(f"has rows without a number in {name}")
+    return values
+
+
+def _contents(files: Sequence[Any]) -> list[bytes]:
+    """Returns the bytes of pictures."""
+    contents = [file.get("bytes") for file in files if isinstance(file, dict)]
+    known = [content for content in contents if isinstance(content, bytes)]
+    if len(known) < len(files):
+        raise FormatError("does not keep its pictures beside the actions")
+    return known
+
+
+def _file(
+    dataset: _Dataset, kind: str, chunk_index: int, file_index: int
+) -> pathlib.Path:
+    """Fills in a template of a path."""
+    values = {"chunk_index": chunk_index, "file_index": file_index}
+    try:
+        name = dataset.paths[kind].format(video_key=dataset.camera, **values)
+    except (LookupError, AttributeError, ValueError) as error:
+        raise FormatError(f"has {kind}_path={dataset.paths[kind]!r:.200}") from error
+    return _inside(dataset.root, name)
+
+
+def _inside(root: pathlib.Path, relative: str) -> pathlib.Path:
+    """Returns the true path of a dataset's file.
+
+    Raises:
+      FormatError: it is not in the dataset's folder.
+    """
+    parts = pathlib.PurePosixPath(relative).parts
+    is_name = parts and parts[0] != "/" and ".." not in parts and len(relative) < 4096
+    if not is_name or not relative.isprintable():
+        raise FormatError(f"refers to a file {relative!r:.200}, which is not in it")
+    true_root = os.path.realpath(root)
+    path = os.path.realpath(os.path.join(true_root, *parts))
+    if os.path.commonpath([path, true_root]) != true_root:
         raise FormatError(
-            f"has a video that ends after {count} of the {episode.length} frames of "
-            f"episode {episode.index}"
+            f"has a link to somewhere else in {relative!r:.200}; copy the folder with "
+            "`cp -rL`, which follows links"
         )
-    return stacked
+    return pathlib.Path(path)

@@ -3,87 +3,89 @@
 Source of the format: Farama-Foundation/Minari, minari/dataset.
 """
 
-import importlib.util
 import json
 import pathlib
 import re
 from collections.abc import Iterator
 from typing import Any
 
-from jaxil.demonstrations.readers import json_file, messages, minari_file
-from jaxil.demonstrations.readers.child import Child
-from jaxil.demonstrations.readers.recording import FormatError, PixelEpisode, Recording
+import numpy as np
+
+from jaxil.demonstrations.readers.frames import decode_pictures
+from jaxil.demonstrations.readers.recording import (
+    FormatError,
+    Item,
+    PixelEpisode,
+    ReadOptions,
+    Recording,
+    first_bytes,
+    read_json,
+)
+from jaxil.files.untrusted import require_regular
 
 _DATA, _METADATA = "main_data.hdf5", "metadata.json"
-_HDF5 = b"\x89HDF\r\n\x1a\n"
-_MAX_METADATA_BYTES = 64 * 1024**2  # it has the bounds of every pixel
-_HEAD_BYTES = 4096  # of the metadata, where the keys are that tell the format
+_HDF5, _JPEG = b"\x89HDF\r\n\x1a\n", b"\xff\xd8\xff"
+_FILTERS = {1, 2, 3, 32000}  # gzip, shuffle, fletcher32, lzf: no plug-ins
+_MAX_RATIO = 1100  # unpacked to packed; gzip, the tightest of them, reaches 1032
 
 
 def recognises(path: pathlib.Path) -> bool:
-    """Tells whether this is a dataset's folder, or its `data` folder; never raises."""
+    """Tells whether this is a dataset's folder, or its `data` folder."""
     try:
         folder = _data_folder(path)
-        if (folder / _DATA).is_file():
-            with (folder / _DATA).open("rb") as file:
-                return file.read(len(_HDF5)) == _HDF5
-        with (folder / _METADATA).open("rb") as file:
-            head = file.read(_HEAD_BYTES)
-        return b'"data_format"' in head and b'"total_episodes"' in head
     except (OSError, ValueError):
         return False
+    head = first_bytes(folder / _METADATA, 4096)
+    is_described = b'"data_format"' in head and b'"total_episodes"' in head
+    return is_described or first_bytes(folder / _DATA, len(_HDF5)) == _HDF5
 
 
-def open_recording(path: pathlib.Path, *, max_bytes: int) -> Recording:
-    """Opens a dataset whose observations hold exactly one image.
+def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
+    """Reads a dataset whose observations hold exactly one image; see `recording`.
 
     That image is uint8 [H, W, 3], stored as it is or, as Minari does by itself from 32
     pixels a side on, as a JPEG. It may stand alone or in a dictionary. Actions that are
-    no vectors of real numbers are left out, with a note.
-
-    Args:
-      path: the dataset's folder, or the `data` folder in it.
-      max_bytes: of one episode's images.
-
-    Raises:
-      FormatError: it is no such dataset, or h5py is not installed.
-      OSError: it cannot be opened.
+    not vectors of real numbers are left out, with a note.
     """
     folder = _data_folder(path)
     metadata = {}  # older datasets have none
     if (folder / _METADATA).exists():
-        metadata = json_file.read_object(
-            folder / _METADATA, max_bytes=_MAX_METADATA_BYTES
-        )
+        metadata = read_json(folder / _METADATA)
     stored_as = metadata.get("data_format", "hdf5")
     if stored_as != "hdf5":
         raise FormatError(f"has data_format={stored_as!r:.50}; only 'hdf5' can be read")
-    if importlib.util.find_spec("h5py") is None:
-        raise FormatError("needs h5py: pip install 'jaxil[minari]'")
-    file = folder / _DATA
-    with _start(file, max_bytes) as child:
-        facts = messages.receive(child, max_bytes=max_bytes).facts
-    num_episodes = facts["num_episodes"]
-    promised = metadata.get("total_episodes", num_episodes)
-    if promised != num_episodes:
-        raise FormatError(
-            f"holds {num_episodes} episodes, where {_METADATA} says {promised!r:.50}"
-        )
-
-    def episodes() -> Iterator[PixelEpisode]:
-        with _start(file, max_bytes) as child:
-            messages.receive(child, max_bytes=max_bytes)
-            for _ in range(num_episodes):
-                arrays = messages.receive(child, max_bytes=max_bytes).arrays
-                yield PixelEpisode(**arrays)
-
-    return Recording(
-        kind="Minari dataset",
-        num_episodes=num_episodes,
-        episodes=episodes(),
-        task=_task_of(metadata),
-        notes=tuple(facts["notes"]),
-    )
+    try:
+        import h5py
+    except ImportError:
+        raise FormatError("needs h5py: pip install 'jaxil[minari]'") from None
+    require_regular(folder / _DATA)
+    with h5py.File(folder / _DATA, "r", locking=False) as file:
+        found = [re.fullmatch(r"episode_(\d{1,9})", str(name)) for name in file]
+        numbers = sorted(int(match[1]) for match in found if match is not None)
+        if not numbers or numbers != list(range(len(numbers))):
+            raise FormatError("has no episodes that are numbered from 0 on")
+        promised = metadata.get("total_episodes", len(numbers))
+        if promised != len(numbers):
+            raise FormatError(
+                f"holds {len(numbers)} episodes, where {_METADATA} says "
+                f"{promised!r:.50}"
+            )
+        first = _member(file, "episode_0")
+        image = _image_in(first)
+        notes = ()
+        if _is_jpeg(_member(first, image)):
+            notes += ("Its images were stored as JPEG, which changes them slightly.",)
+        if _actions(first, options) is None:
+            notes += ("Its actions are not vectors of real numbers, and not read.",)
+        task = _task_of(metadata)
+        yield Recording("Minari dataset", len(numbers), task=task, notes=notes)
+        for number in numbers:
+            episode = _member(file, f"episode_{number}")
+            yield PixelEpisode(
+                _frames(_member(episode, image), options),
+                _actions(episode, options),
+                _values(_member(episode, "rewards"), options),
+            )
 
 
 def _data_folder(path: pathlib.Path) -> pathlib.Path:
@@ -91,15 +93,101 @@ def _data_folder(path: pathlib.Path) -> pathlib.Path:
     return inner if not (path / _METADATA).is_file() and inner.is_dir() else path
 
 
-def _start(file: pathlib.Path, max_bytes: int) -> Child:
-    return messages.open_child(minari_file.__name__, file, max_bytes=max_bytes)
-
-
 def _task_of(metadata: dict[str, Any]) -> str | None:
-    """Returns the task where it is one of dm_control, by the names that Shimmy uses."""
+    """Returns the task if it is one of dm_control, by the names that Shimmy uses."""
     try:
         name = json.loads(metadata["env_spec"])["id"]
         found = re.fullmatch(r"dm_control/([a-z_]+)-([a-z_]+)-v\d+", name)
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
     return None if found is None else f"{found[1]}_{found[2]}"
+
+
+def _member(group: Any, path: str) -> Any:
+    """Returns a group or dataset that lies in this file."""
+    import h5py
+
+    for name in path.split("/"):
+        if not isinstance(group, h5py.Group) or name not in group:
+            raise FormatError(f"has no {name} in {group.name}")
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            raise FormatError(f"has a link in place of {name}")
+        group = group[name]
+    return group
+
+
+def _image_in(episode: Any) -> str:
+    """Returns the path to the one image of an observation."""
+    import h5py
+
+    observations = _member(episode, "observations")
+    found = [("observations", observations)]
+    if isinstance(observations, h5py.Group):  # a dictionary; links are not followed
+        observations.visititems(
+            lambda path, x: found.append((f"observations/{path}", x))
+        )
+    datasets = {path: x for path, x in found if isinstance(x, h5py.Dataset)}
+    images = [p for p, x in datasets.items() if _is_plain(x) or _is_jpeg(x)]
+    if len(images) != 1:
+        listed = ", ".join(f"{p} of {x.dtype} {x.shape}" for p, x in datasets.items())
+        raise FormatError(
+            f"has {len(images)} images of type uint8 and shape [H, W, 3] in an "
+            f"observation, not one: {listed}"
+        )
+    return images[0]
+
+
+def _is_plain(dataset: Any) -> bool:
+    return dataset.dtype == np.uint8 and dataset.ndim == 4 and dataset.shape[3] == 3
+
+
+def _is_jpeg(dataset: Any) -> bool:
+    """Tells whether these are JPEGs: rows, or arrays where lengths are not equal."""
+    import h5py
+
+    rows = dataset.dtype == np.uint8 and dataset.ndim == 2
+    if not rows and not (dataset.ndim == 1 and h5py.check_vlen_dtype(dataset.dtype)):
+        return False
+    _check(dataset, ReadOptions(max_bytes=2**40))
+    return len(dataset) > 0 and bytes(dataset[0][: len(_JPEG)]) == _JPEG
+
+
+def _frames(dataset: Any, options: ReadOptions) -> np.ndarray:
+    if not _is_plain(dataset) and _is_jpeg(dataset):
+        _check(dataset, options)
+        files = [np.asarray(row, np.uint8).tobytes() for row in dataset]
+        return decode_pictures(files, options)
+    return _values(dataset, options)
+
+
+def _actions(episode: Any, options: ReadOptions) -> np.ndarray | None:
+    """Returns actions [T, A]; None where they are something else."""
+    dataset = _member(episode, "actions")
+    if getattr(dataset, "dtype", np.dtype("O")).kind != "f" or dataset.ndim > 2:
+        return None
+    values = _values(dataset, options)
+    return values[:, None] if values.ndim == 1 else values
+
+
+def _values(dataset: Any, options: ReadOptions) -> np.ndarray:
+    _check(dataset, options)
+    return dataset[()]
+
+
+def _check(dataset: Any, options: ReadOptions) -> None:
+    """Raises FormatError where a dataset's values lie elsewhere, or are too many."""
+    if not hasattr(dataset, "dtype"):
+        raise FormatError(f"has no numbers in {dataset.name}")
+    name, plan = dataset.name, dataset.id.get_create_plist()
+    if dataset.is_virtual or dataset.external:
+        raise FormatError(f"keeps {name} in another file")
+    filters = {plan.get_filter(i)[0] for i in range(plan.get_nfilters())}
+    if not filters <= _FILTERS:
+        raise FormatError(f"has {name} packed by unknown filters {sorted(filters)}")
+    num_bytes = dataset.size * dataset.dtype.itemsize
+    options.check_bytes(f"{name} of shape {dataset.shape}", num_bytes)
+    stored = dataset.id.get_storage_size()
+    if num_bytes > stored * (_MAX_RATIO if filters else 1):
+        raise FormatError(
+            f"is damaged: {name} has {num_bytes} bytes, but only {stored} are stored"
+        )

@@ -16,7 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from jaxil.demonstrations.readers.recording import FormatError, PixelEpisode, Recording
+from jaxil.demonstrations.readers.recording import (
+    FormatError,
+    Item,
+    PixelEpisode,
+    ReadOptions,
+    Recording,
+    naming,
+)
 from jaxil.files import archive
 
 FORMAT = "jaxil-pixels"
@@ -34,8 +41,8 @@ def write_pixels(path: str | os.PathLike, recording: Recording, *, origin: str) 
       origin: where the pixels come from, for people.
 
     Raises:
-      FormatError: an episode of the recording can't be read.
-      OSError: the file can't be written.
+      FormatError: an episode of the recording cannot be read.
+      OSError: the file cannot be written.
     """
     metadata: dict[str, Any] = {
         "format": FORMAT,
@@ -62,40 +69,39 @@ def write_pixels(path: str | os.PathLike, recording: Recording, *, origin: str) 
 
 
 def recognises(path: pathlib.Path) -> bool:
-    """Says whether `path` is a file of this format, as far as its names tell."""
+    """Tells whether `path` is a file of this format, as far as its names tell."""
     names = archive.member_names(path)
     return "metadata" in names and "frames_0" in names
 
 
-def open_recording(path: pathlib.Path, *, max_bytes: int) -> Recording:
-    """Opens a file of `write_pixels`.
-
-    Args:
-      path: the file.
-      max_bytes: the largest array to unpack.
-
-    Raises:
-      FormatError: the file breaks the format's rules.
-      OSError: it can't be opened.
-    """
-    metadata = _read_metadata(path)
-    return Recording(
+def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
+    """Reads a file of `write_pixels`; see `recording`."""
+    with naming(path, path):
+        metadata = _read_metadata(path)
+    yield Recording(
         kind="jaxil pixels",
         num_episodes=metadata["num_episodes"],
-        episodes=_episodes(path, metadata, max_bytes),
         notes=(f"Made from: {metadata['origin']}.",),
         **{name: metadata[name] for name in _OPTIONAL},
     )
+    for index in range(metadata["num_episodes"]):
+        names = {"frames": f"frames_{index}"}
+        for name in ("actions", "rewards"):
+            if metadata[f"has_{name}"][index]:
+                names[name] = f"{name}_{index}"
+        limits = dict.fromkeys(names.values(), options.max_bytes)
+        with naming(path, path):
+            arrays = archive.read_archive(path, max_bytes=limits)
+        known = {name: arrays[stored] for name, stored in names.items()}
+        yield PixelEpisode(stored_size=None, **known)
 
 
 def _read_metadata(path: pathlib.Path) -> dict[str, Any]:
+    text = archive.read_archive(path, max_bytes={"metadata": _MAX_METADATA_BYTES})
     try:
-        text = archive.read_archive(path, max_bytes={"metadata": _MAX_METADATA_BYTES})
         metadata = json.loads(str(text["metadata"]))
-    except (json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise FormatError(f"has metadata that are not JSON ({error})") from error
-    except ValueError as error:
-        raise FormatError(str(error)) from error
     if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
         raise FormatError("has frames, but metadata that lack the format's name")
     if metadata.get("version") != VERSION:
@@ -125,20 +131,3 @@ def _read_metadata(path: pathlib.Path) -> dict[str, Any]:
     if not isinstance(metadata.get("origin"), str):
         raise FormatError("has metadata without origin")
     return {**dict.fromkeys(_OPTIONAL), **metadata}
-
-
-def _episodes(
-    path: pathlib.Path, metadata: dict[str, Any], max_bytes: int
-) -> Iterator[PixelEpisode]:
-    for index in range(metadata["num_episodes"]):
-        names = {"frames": f"frames_{index}"}
-        for name in ("actions", "rewards"):
-            if metadata[f"has_{name}"][index]:
-                names[name] = f"{name}_{index}"
-        try:
-            arrays = archive.read_archive(
-                path, max_bytes=dict.fromkeys(names.values(), max_bytes)
-            )
-        except ValueError as error:
-            raise FormatError(str(error)) from error
-        yield PixelEpisode(**{name: arrays[stored] for name, stored in names.items()})

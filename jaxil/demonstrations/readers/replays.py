@@ -23,8 +23,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxil.demonstrations.readers.recording import FormatError, PixelEpisode, Recording
-from jaxil.demonstrations.readers.stacks import newest_frames, numbers_per_step
+from jaxil.demonstrations.readers.frames import newest_frames
+from jaxil.demonstrations.readers.recording import (
+    FormatError,
+    Item,
+    PixelEpisode,
+    ReadOptions,
+    Recording,
+    checked_episode,
+    naming,
+)
 from jaxil.files import archive
 
 _KINDS = {"image": "DreamerV2 or V-D4RL replay", "observation": "DrQ-v2 replay"}
@@ -32,31 +40,25 @@ _MAX_FLAG_BYTES = 16 * 1024**2
 
 
 def recognises(path: pathlib.Path) -> bool:
-    """Says whether `path` is such a file or a folder with one, by its arrays' names."""
+    """Tells whether this is an episode or a folder with one, by the arrays' names."""
     try:
         return any(_frames_name(archive.member_names(file)) for file in _files(path))
     except (OSError, ValueError):
         return False
 
 
-def open_recording(path: pathlib.Path, *, max_bytes: int) -> Recording:
-    """Opens a replay's folder, or one file of it; episodes come sorted by file name.
+def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
+    """Reads a replay's folder, or one file of it, sorted by name; see `recording`.
 
-    Args:
-      path: folder or file. Other files in the folder are ignored.
-      max_bytes: the largest array to unpack.
-
-    Raises:
-      FormatError: it holds no episode, or a damaged `.npz` file.
-      OSError: it can't be opened.
+    Other files in the folder are ignored.
     """
-    path.stat()  # a path that leads nowhere is no question of formats
     kinds = {}
     files = list(_files(path))
     for file in files:
-        names = archive.member_names(file)
-        if not names:
-            raise _fault(path, file, "is cut off, damaged or no .npz file")
+        with naming(file, path):
+            names = archive.member_names(file)
+            if not names:
+                raise FormatError("is cut off, damaged or no .npz file")
         if frames_name := _frames_name(names):
             kinds[file] = _KINDS[frames_name]
     if not kinds:
@@ -68,12 +70,11 @@ def open_recording(path: pathlib.Path, *, max_bytes: int) -> Recording:
     if len(kinds) < len(files):
         num_others = len(files) - len(kinds)
         notes = (f"{num_others} of its {len(files)} .npz files hold no episode.",)
-    return Recording(
-        kind=" and ".join(sorted(set(kinds.values()))),
-        num_episodes=len(kinds),
-        episodes=_episodes(path, list(kinds), max_bytes),
-        notes=notes,
-    )
+    yield Recording(" and ".join(sorted(set(kinds.values()))), len(kinds), notes=notes)
+    for index, file in enumerate(kinds):
+        with naming(file, path):
+            episode = checked_episode(index, _read_file(file, options.max_bytes))
+        yield episode
 
 
 def _files(path: pathlib.Path) -> Iterator[pathlib.Path]:
@@ -87,40 +88,13 @@ def _files(path: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def _frames_name(names: frozenset[str]) -> str:
-    """Returns what an episode calls its pictures; "" if the names are of another file.
-
-    The metadata or states of jaxil's own files tell them from episodes.
-    """
+    """Returns what an episode calls its pictures; "" for other files, jaxil's too."""
     if not {"action", "reward"} <= names or names & {"qpos", "metadata"}:
         return ""
     return next((name for name in _KINDS if name in names), "")
 
 
-def _episodes(
-    path: pathlib.Path, files: list[pathlib.Path], max_bytes: int
-) -> Iterator[PixelEpisode]:
-    for file in files:
-        try:
-            episode = _read(file, max_bytes)
-        except ValueError as error:
-            raise _fault(path, file, str(error)) from error
-        yield episode
-
-
-def _fault(path: pathlib.Path, file: pathlib.Path, fault: str) -> FormatError:
-    """Returns the error that names a folder's file; in a single file, it is known."""
-    if file == path:
-        return FormatError(fault)
-    return FormatError(f"holds {ascii(file.name)[1:-1]}, which {fault}")
-
-
-def _read(file: pathlib.Path, max_bytes: int) -> PixelEpisode:
-    """Reads an episode.
-
-    Raises:
-      FormatError: it breaks the rules.
-      OSError: it can't be opened.
-    """
+def _read_file(file: pathlib.Path, max_bytes: int) -> PixelEpisode:
     names = archive.member_names(file)
     frames_name = _frames_name(names)
     limits = dict.fromkeys((frames_name, "action", "reward"), max_bytes)
@@ -131,16 +105,13 @@ def _read(file: pathlib.Path, max_bytes: int) -> PixelEpisode:
     lengths = {shape[:1] for shape in shapes.values()}
     if len(lengths) > 1 or min(lengths) < (2,):
         raise FormatError(f"has arrays of unequal length, or too few steps: {shapes}")
-    if "is_first" in arrays:
-        is_first = numbers_per_step("is_first", arrays["is_first"], 1)
-        if np.any(is_first[1:]):
-            raise FormatError("holds more than one episode: is_first is true again")
-    actions = numbers_per_step("actions", arrays["action"], 2)
+    if "is_first" in arrays and np.any(arrays["is_first"][1:]):
+        raise FormatError("holds more than one episode: is_first is true again")
     # DreamerV3's chunks have the same names, but the action after each observation.
-    if "stepid" in names or np.any(actions[0]):
+    if "stepid" in names or np.any(arrays["action"][0]):
         raise FormatError(
             "begins with an action, where the reset's zeros belong: it seems to pair "
             "actions with observations in another way than DrQ-v2 and DreamerV2"
         )
-    rewards = numbers_per_step("rewards", arrays["reward"], 1)
-    return PixelEpisode(newest_frames(arrays[frames_name]), actions[1:], rewards[1:])
+    frames = newest_frames(arrays[frames_name])
+    return PixelEpisode(frames, arrays["action"][1:], arrays["reward"][1:])

@@ -1,142 +1,236 @@
-"""Video files (MP4, GIF, WebM), one episode each: frames without actions or rewards."""
+"""Video files, one episode each: frames without actions or rewards. Decoded by PyAV.
+
+A file's first bytes choose the parser, and the parser gets the opened file, not its
+name: a playlist disguised as a video cannot make it open anything else.
+"""
 
 import contextlib
 import itertools
-import os
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
+from PIL import Image
 
-from jaxil.demonstrations.readers import clips
-from jaxil.demonstrations.readers.recording import FormatError, PixelEpisode, Recording
+from jaxil.demonstrations.readers.frames import resized
+from jaxil.demonstrations.readers.recording import (
+    FormatError,
+    Item,
+    PixelEpisode,
+    ReadOptions,
+    Recording,
+    first_bytes,
+    naming,
+)
 
-_SUFFIXES = (".mp4", ".m4v", ".mov", ".gif", ".webm", ".mkv")
+_SUFFIXES = (".mp4", ".m4v", ".mov", ".gif", ".webm", ".mkv", ".avi")
+_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")  # that begin MP4 or MOV
 _MAX_ENTRIES = 1000  # of a folder, looked at to find out whether it holds videos
+_UNEVEN = 1.5  # longest time between two frames, over the shortest
+_FRAMES_PER_BREATH = 30  # after which the reader shows that it still works
+
+_Frame = tuple[np.ndarray, tuple[int, int]]  # scaled, with the size in the file
 
 
 def recognises(path: pathlib.Path) -> bool:
-    """Tells whether this is a video file, or a folder that holds one; never raises."""
+    """Tells whether this is a video file, or a folder that holds one."""
     try:
         if not path.is_dir():
-            return clips.parser_of(path) is not None
-        with os.scandir(path) as entries:
-            return any(
-                clips.parser_of(pathlib.Path(entry)) is not None
-                for entry in itertools.islice(entries, _MAX_ENTRIES)
-                if not entry.name.startswith(".")
-            )
+            return _parser_of(path) is not None
+        entries = itertools.islice(_visible(path), _MAX_ENTRIES)
+        return any(_parser_of(entry) is not None for entry in entries)
     except (OSError, ValueError):
         return False
 
 
-def open_recording(
-    path: pathlib.Path, *, max_bytes: int, frame_skip: int = 1
-) -> Recording:
-    """Opens a video file, or a folder of them, sorted by name.
+def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
+    """Reads a video file, or a folder of them, sorted by name; see `recording`.
 
     Frames are taken as they are stored, each once, whatever the times between them; one
-    of another size is scaled to the first one's. They are decoded by ffmpeg; where it
-    speaks of an error, the file is refused.
-
-    Args:
-      path: the file or folder.
-      max_bytes: of one video's decoded frames, those skipped not counted.
-      frame_skip: every n-th frame is kept, beginning with the first; >= 1.
-
-    Raises:
-      FormatError: there is no video, or the first one cannot be used.
-      OSError: it cannot be opened.
+    of another size is scaled to the first one's. Where FFmpeg reports an error, the
+    file is refused.
     """
-    if frame_skip < 1:
-        raise ValueError(f"frame_skip = {frame_skip}: expected >= 1")
-    is_folder = path.is_dir()
-    files, ignored = _files_in(path) if is_folder else ([path], [])
-    with _blaming(files[0], is_folder):
-        first = clips.probe(files[0], max_bytes=max_bytes, frame_skip=frame_skip)
-
-    def episodes() -> Iterator[PixelEpisode]:
-        for file in files:
-            with _blaming(file, is_folder):
-                clip = first
-                if file != files[0]:
-                    clip = clips.probe(file, max_bytes=max_bytes, frame_skip=frame_skip)
-                    _check_rate(clip, first, files[0])
-                frames = _read(file, clip, max_bytes=max_bytes, frame_skip=frame_skip)
-            yield PixelEpisode(frames)
-
-    notes = []
-    if not first.is_even:
-        notes.append(
-            f"{files[0].name} shows its frames for unequal times; they are taken as "
-            "equal."
-        )
-    if ignored:
-        names = ", ".join(ignored[:3]) + (", ..." if len(ignored) > 3 else "")
-        notes.append(f"What is no video is not read: {names}.")
-    rate = first.frames_per_second
-    return Recording(
-        kind="folder of videos" if is_folder else "video",
-        num_episodes=len(files),
-        episodes=episodes(),
-        frames_per_second=None if rate is None else rate / frame_skip,
-        notes=tuple(notes),
-    )
-
-
-def _read(
-    path: pathlib.Path, clip: clips.Clip, *, max_bytes: int, frame_skip: int
-) -> np.ndarray:
-    """Returns every n-th frame, [N, H, W, 3]."""
-    pixels = bytearray()  # grows where it stands, so there is never a second copy
-    shape = (clip.height, clip.width, 3)
-    seconds = clips.cpu_seconds_for(clip, path.stat().st_size)
-    num_frames = 0
-    for frame in clips.decode(path, max_frame_bytes=max_bytes, cpu_seconds=seconds):
-        shape = frame.shape
-        if num_frames % frame_skip == 0:
-            # It may hold other frames than it says.
-            kept = num_frames // frame_skip + 1
-            clips.check_size(kept, shape[0], shape[1], max_bytes)
-            pixels += frame.data.cast("B")
-        num_frames += 1
-    clips.check_number(num_frames, frame_skip)
-    return np.frombuffer(pixels, np.uint8).reshape(-1, *shape)
-
-
-def _files_in(folder: pathlib.Path) -> tuple[list[pathlib.Path], list[str]]:
-    """Returns a folder's videos and the names of everything else, both sorted."""
-    files, others = [], []
-    for path in sorted(folder.iterdir()):
-        if path.name.startswith("."):
-            continue
-        if clips.parser_of(path) is not None:
-            files.append(path)
-        elif path.suffix.lower() in _SUFFIXES:
-            raise FormatError(f"holds {path.name}, which is no video")
-        else:
-            others.append(path.name)
+    files, others = [path], []
+    if path.is_dir():
+        files = [x for x in sorted(_visible(path)) if _parser_of(x) is not None]
+        others = sorted(set(_visible(path)) - set(files))
+    for other in others:
+        if other.suffix.lower() in _SUFFIXES:
+            raise FormatError(f"holds {other.name}, which is no video")
     if not files:
-        raise FormatError("holds no video (MP4, GIF or WebM)")
-    return files, others
+        raise FormatError("holds no video")
+    with naming(files[0], path):
+        rate, is_even = timing(files[0])
+    notes = ()
+    if not is_even:
+        notes += (
+            f"{files[0].name} shows its frames for unequal times; they are taken as "
+            "equal.",
+        )
+    if others:
+        notes += (f"{len(others)} other files, {others[0].name} first, are not read.",)
+    yield Recording(
+        kind="folder of videos" if path.is_dir() else "video",
+        num_episodes=len(files),
+        frames_per_second=rate and rate / options.frame_skip,
+        notes=notes,
+    )
+    for file in files:
+        with naming(file, path):
+            other_rate, _ = timing(file)
+            if rate and other_rate and not 0.95 < other_rate / rate < 1.05:
+                raise FormatError(
+                    f"has {other_rate:.4g} frames per second, where {files[0].name} "
+                    f"has {rate:.4g}"
+                )
+            yield from collect(decode(file, options), options)
+
+
+def collect(
+    frames: Iterable[_Frame], options: ReadOptions
+) -> Iterator[PixelEpisode | None]:
+    """Yields None for every few decoded frames, and then all of them as an episode."""
+    pixels = bytearray()  # grows in its place, so that there is never a second copy
+    shape, stored_size, num_frames = (1, 1, 3), None, 0
+    for frame, size in frames:
+        if num_frames % options.frame_skip == 0:
+            shape, stored_size = frame.shape, stored_size or size
+            pixels += frame.tobytes()
+            what = f"{num_frames + 1} or more frames of {shape[1]}x{shape[0]} pixels,"
+            options.check_bytes(what, len(pixels))
+        num_frames += 1
+        if num_frames % _FRAMES_PER_BREATH == 0:
+            yield None
+    if num_frames <= options.frame_skip:
+        raise FormatError(
+            f"has {num_frames} frames, too few to keep two with "
+            f"frame_skip={options.frame_skip}"
+        )
+    episode = np.frombuffer(pixels, np.uint8).reshape(-1, *shape)
+    yield PixelEpisode(episode, stored_size=stored_size)
+
+
+def timing(path: pathlib.Path) -> tuple[float | None, bool]:
+    """Returns a video's frames per second, and whether they are evenly spaced.
+
+    Nothing is decoded. The rate is None where the file has no times.
+    """
+    file_bytes, packet_bytes, num_frames, times = path.stat().st_size, 0, 0, []
+    with _opened(path) as (container, stream):
+        for packet in container.demux(stream):
+            if packet.size == 0:
+                continue  # the end
+            num_frames += 1
+            packet_bytes += packet.size
+            if packet_bytes > file_bytes:
+                raise FormatError("is damaged: its frames overlap")
+            time = packet.dts if packet.pts is None else packet.pts
+            if time is not None:
+                times.append(time)
+        unit, rate = stream.time_base, stream.average_rate
+    if _parser_of(path) == "gif" and _frames_of_gif(path) != num_frames:
+        raise FormatError(f"is cut off or damaged after {num_frames} frames")
+    times.sort()
+    gaps = [later - earlier for earlier, later in itertools.pairwise(times)]
+    if unit and sum(gaps):
+        rate = len(gaps) / (sum(gaps) * unit)
+    # Clocks count as coarsely as in milliseconds, hence the 1.
+    is_even = not gaps or max(gaps) - 1 <= _UNEVEN * (min(gaps) + 1)
+    return rate and float(rate), is_even
+
+
+def _frames_of_gif(path: pathlib.Path) -> int:
+    """Returns the number of a GIF's frames, since FFmpeg takes damage for its end."""
+    if not path.read_bytes().rstrip(b"\0\r\n ").endswith(b";"):
+        return -1
+    try:
+        with Image.open(path, formats=("GIF",)) as image:
+            return getattr(image, "n_frames", 1)
+    except Exception:  # whatever a parser of Pillow stumbles over
+        return -1
+
+
+def decode(path: pathlib.Path, options: ReadOptions) -> Iterator[_Frame]:
+    """Yields all frames [H, W, 3], upright and scaled, with the size in the file."""
+    from av.video.reformatter import VideoReformatter
+
+    size = None
+    reformatter = VideoReformatter()
+    with _opened(path) as (container, stream):
+        for frame in container.decode(stream):
+            rgb = reformatter.reformat(frame, format="rgb24", threads=1)
+            picture = _upright(rgb.to_ndarray(), frame)
+            stored = picture.shape[:2]
+            if size is None:
+                size = _wanted_size(stored, options)
+            yield resized(picture, size), stored
 
 
 @contextlib.contextmanager
-def _blaming(file: pathlib.Path, is_folder: bool) -> Iterator[None]:
-    """Where a whole folder is read, names the file that a fault is in."""
+def _opened(path: pathlib.Path) -> Iterator[tuple[Any, Any]]:
+    """Opens a file's first moving picture; FFmpeg's complaints become FormatErrors."""
+    import av
+    import av.error
+    import av.logging
+
+    parser = _parser_of(path)
+    if parser is None:
+        raise FormatError("is no video, or no regular file")
+    av.logging.set_level(av.logging.ERROR)
+    av.logging.set_skip_repeated(False)
     try:
-        yield
-    except FormatError as error:
-        if not is_folder:
-            raise
-        raise FormatError(f"holds {file.name}, which {error}") from error
+        with (
+            path.open("rb") as file,
+            av.logging.Capture() as complaints,
+            av.open(file, format=parser) as container,
+        ):
+            if not container.streams.video:
+                raise FormatError("has no moving picture")
+            stream = container.streams.video[0]
+            stream.codec_context.thread_count = 1
+            stream.codec_context.options = {"err_detect": "explode"}
+            yield container, stream
+    except av.error.FFmpegError as error:
+        raise FormatError(f"is cut off or damaged (FFmpeg: {error})") from error
+    if complaints:
+        raise FormatError(f"is cut off or damaged (FFmpeg: {complaints[0][2]})")
 
 
-def _check_rate(clip: clips.Clip, first: clips.Clip, first_file: pathlib.Path) -> None:
-    """Raises FormatError where two videos' time runs at different speeds."""
-    rate, expected = clip.frames_per_second, first.frames_per_second
-    if rate and expected and not 0.95 < rate / expected < 1.05:
-        raise FormatError(
-            f"has {rate:.4g} frames per second, where {first_file.name} has "
-            f"{expected:.4g}"
-        )
+def _upright(picture: np.ndarray, frame: Any) -> np.ndarray:
+    """Returns a picture [H, W, 3], turned as its frame asks for."""
+    from av.sidedata.sidedata import Type
+
+    matrix = frame.side_data.get(Type.DISPLAYMATRIX)
+    if matrix is None:
+        return picture
+    # x' = a x + c y, y' = b x + d y, where all but quarter turns and flips is ignored.
+    a, b, _, c, d = np.frombuffer(matrix, np.int32)[:5].tolist()
+    if abs(b) > abs(a):
+        picture, a, d = picture.swapaxes(0, 1), c, b
+    return np.ascontiguousarray(picture[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
+
+
+def _wanted_size(stored: tuple[int, int], options: ReadOptions) -> tuple[int, int]:
+    if options.image_size is None:
+        return stored
+    if not options.keep_aspect:
+        return options.image_size, options.image_size
+    scale = min(1.0, options.image_size / min(stored))
+    return max(1, round(stored[0] * scale)), max(1, round(stored[1] * scale))
+
+
+def _parser_of(path: pathlib.Path) -> str | None:
+    """Returns what FFmpeg calls the format of a file; None for no video."""
+    start = first_bytes(path, 12)
+    if start[4:8] in _BOXES:
+        return "mov"
+    if start.startswith((b"GIF87a", b"GIF89a")):
+        return "gif"
+    if start.startswith(b"RIFF") and start.endswith(b"AVI "):
+        return "avi"
+    return "matroska" if start.startswith(b"\x1aE\xdf\xa3") else None
+
+
+def _visible(folder: pathlib.Path) -> Iterator[pathlib.Path]:
+    return (path for path in folder.iterdir() if not path.name.startswith("."))

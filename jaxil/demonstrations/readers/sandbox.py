@@ -1,0 +1,80 @@
+"""Readers in a child process, with limits on time and memory.
+
+Parsers written in C may crash or run forever on hostile bytes. In a process of their
+own they end alone, and the file is refused with a FormatError.
+"""
+
+import os
+import pathlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from jaxil.demonstrations.readers.recording import (
+    FormatError,
+    Item,
+    PixelEpisode,
+    ReadOptions,
+    Recording,
+    checked,
+)
+from jaxil.machine.child import Child, ChildError
+
+_CPU_SECONDS = 20  # from one item to the next, for a tiny file
+_BYTES_PER_SECOND = 10e6  # of a file, read and parsed on a slow machine
+_WAIT_FACTOR = 10  # others use the machine too
+_MEMORY_BYTES = 1024**3  # of the libraries, and of a decoder at 3840x2160 pixels
+_REASONS = {
+    "FormatError": "{text}",
+    "FileNotFoundError": "has a file that cannot be opened ({text})",
+    "timeout": "takes too long to read, which its size does not explain ({text})",
+    "MemoryError": "is damaged: it would fill the memory",
+    "death": "is damaged: it broke the process that read it ({text})",
+}
+
+
+def read_in_child(
+    read: Callable[[pathlib.Path, ReadOptions], Iterator[Item]],
+    path: pathlib.Path,
+    options: ReadOptions,
+) -> Iterator[Item]:
+    """Yields what a module's `read` yields, checked, from a child process.
+
+    Raises:
+      FormatError: it found a fault, or the child took too long or died.
+    """
+    file_bytes = path.stat().st_size if path.is_file() else 0
+    cpu_seconds = _CPU_SECONDS + round(file_bytes / _BYTES_PER_SECOND)
+    try:
+        with Child(
+            _serve,
+            read,
+            path.absolute(),
+            options,
+            seconds=_WAIT_FACTOR * cpu_seconds,
+            cpu_seconds=cpu_seconds,
+            # A pickle is in memory as a whole, and partly twice while it is read.
+            memory_bytes=_MEMORY_BYTES + 2 * options.max_bytes + 3 * file_bytes,
+            answer_bytes=2 * options.max_bytes,
+        ) as child:
+            for content in child:
+                kind = Recording if content and "kind" in content else PixelEpisode
+                yield content and kind(**content)
+    except ChildError as error:
+        reason = _REASONS.get(error.kind, "is cut off or damaged ({kind}: {text})")
+        raise FormatError(reason.format(kind=error.kind, text=error.text)) from error
+
+
+def _serve(
+    read: Callable[[pathlib.Path, ReadOptions], Iterator[Item]],
+    path: pathlib.Path,
+    options: ReadOptions,
+) -> Iterator[dict[str, Any] | None]:
+    """Runs a reader as the child."""
+    os.environ["HDF5_PLUGIN_PRELOAD"] = "::"  # HDF5 loads no plug-ins
+    os.environ["ARROW_DEFAULT_MEMORY_POOL"] = "system"  # others reserve much
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries may complain at length
+    for item in checked(read(path, options)):
+        content = None if item is None else item._asdict()
+        if content is not None:
+            content.pop("episodes", None)
+        yield content
