@@ -11,20 +11,19 @@ ROOT = pathlib.Path(__file__).parent.parent / "jaxil"
 # from itself. What is not named here is a command, on top of all.
 FLOORS = {
     "errors": 0,
-    **dict.fromkeys(("maths", "machine", "files"), 1),
+    **dict.fromkeys(("methods", "maths", "machine", "files"), 1),
     **dict.fromkeys(("native", "replay"), 2),
     **dict.fromkeys(("networks", "environments"), 3),
     **dict.fromkeys(("learner", "demonstrations"), 4),
     "rewarders": 5,
-    "methods": 6,
-    "config": 7,
-    "command": 8,
-    "reporting": 8,
-    "training": 9,
-    "train": 10,
-    "timing": 11,
+    "config": 6,
+    "reporting": 7,
+    "training": 8,
+    "command": 9,  # checks a config as training does
+    "train": 9,
+    "timing": 10,
 }
-TOP = 12
+TOP = 11
 PURE = ("maths", "networks", "learner", "rewarders")
 HOST_ONLY = {"absl", "ml_collections", "dm_control", "dm_env", "os", "time", "pathlib"}
 # Rooms that are handed plain arguments and functions.
