@@ -11,7 +11,7 @@ import signal
 import sys
 import time
 
-from jaxil.command import UsageError
+from jaxil.errors import UsageError
 from jaxil.files.tables import CsvLog
 from jaxil.machine.signals import StopOnSignals
 from jaxil.training import workdir

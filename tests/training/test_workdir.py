@@ -9,7 +9,7 @@ import time
 import pytest
 
 from jaxil import config as jaxil_config
-from jaxil.command import UsageError
+from jaxil.errors import UsageError
 from jaxil.training import workdir
 
 
