@@ -269,6 +269,7 @@ class Run(Parts):
             self.frame,
             counters.seconds,
             counters.num_episodes,
+            pre_tanh=float(counters.metrics.get("actor/pre_tanh", np.nan)),
             distance=result.distance,
             filmed=result.filmed,
         )

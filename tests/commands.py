@@ -56,11 +56,15 @@ def run(module: str, *flags: str, timeout: float = 240.0):
     )
 
 
+def small(method: str) -> tuple[str, ...]:
+    """Returns the flags that make a method small."""
+    return (*SMALL, *(f"--config.{word}" for word in _OWN.get(method, ())))
+
+
 def small_run(method: str, workdir: pathlib.Path) -> tuple[str, ...]:
     """Returns the flags of a run of seconds."""
     return (
         f"--config=configs/tiny.py:{method},ball_in_cup_catch",
         f"--workdir={workdir}",
-        *SMALL,
-        *(f"--config.{word}" for word in _OWN.get(method, ())),
+        *small(method),
     )

@@ -14,7 +14,7 @@ from jaxil import config as jaxil_config
 from jaxil.errors import UsageError
 from jaxil.timing import measurement, start, tables
 from jaxil.timing.bench import Bench
-from tests.commands import SMALL, run
+from tests.commands import run, small
 
 _CONFIG = "--config=configs/tiny.py:pdac,ball_in_cup_catch"
 # What others read: these names stay.
@@ -33,7 +33,7 @@ def measured(tmp_path_factory):
     finished = run(
         "benchmark",
         _CONFIG,
-        *SMALL,
+        *small("pdac"),
         "--config.replay_on_device=False",  # so that batches are pixels
         "--repeats=2",
         "--steps=20",
@@ -119,7 +119,7 @@ def test_a_sweep_measures_each_value(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(measurement, "measure", measure)
     path = tmp_path / "sweep.json"
     flags = ["--full", "--repeats=1", "--sweep=batch_size:8,16", f"--json={path}"]
-    benchmark.main(["benchmark", _CONFIG, *SMALL, "--config.seed=3", *flags])
+    benchmark.main(["benchmark", _CONFIG, *small("pdac"), "--config.seed=3", *flags])
     settings = {"repeats": 1, "steps": 40, "full": True}
     assert seen == [(8, 3, settings), (16, 3, settings)]
     assert [each["sweep"] for each in json.loads(path.read_text())] == [
@@ -170,7 +170,7 @@ def test_a_full_replay_is_full(tmp_path):
 def test_wrong_use_is_told_before_anything_is_measured(flags, expected, monkeypatch):
     monkeypatch.setattr(measurement, "measure", lambda *_, **__: pytest.fail("ran"))
     with pytest.raises(UsageError) as caught:
-        benchmark.main(["benchmark", _CONFIG, *SMALL, *flags])
+        benchmark.main(["benchmark", _CONFIG, *small("pdac"), *flags])
     for text in expected:
         assert text in str(caught.value)
 

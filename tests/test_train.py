@@ -339,6 +339,35 @@ def test_a_stopped_evaluation_is_made_up_for_at_once_and_saved():
     assert not dummies.run.counters.owes_evaluation
 
 
+def test_a_method_that_does_not_play_writes_the_row_of_a_stopped_evaluation_once():
+    dummies = Dummies(eval_every_frames=8, total_frames=16)
+    run, updates = dummies.run, []
+    run.player = None
+    metrics = {"actor/loss": np.float32(0.5)}
+    run.updates.run = lambda state: (state, metrics)
+    run.log.updates = lambda **row: updates.append((row["frame"], row["metrics"]))
+    evaluate = run.evaluator.evaluate
+
+    def stopped(*arguments, **named):
+        run.stop_asked = True
+        return evaluate(*arguments, **named)
+
+    run.evaluator.evaluate = stopped
+    dummies.loop()
+    run.evaluator.evaluate, run.stop_asked = evaluate, False
+    dummies.loop()
+    assert updates == [(frame, {"actor/loss": 0.5}) for frame in (8, 16)]
+    words = [word for word in dummies.tape if word != "update"]
+    assert words == [
+        "evaluation stopped",
+        "save",
+        "evaluate",
+        "save",
+        "last evaluation",
+        "save",
+    ]
+
+
 def test_the_end_of_environments_names_the_way_on(monkeypatch, tmp_path):
     dummies = Dummies()
 

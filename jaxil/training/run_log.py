@@ -97,7 +97,6 @@ class Outputs:
             self._expert_return = demonstrations.mean_return()
             if demonstrations.frames.ndim == 5:
                 self._expert_frames = demonstrations.frames[0]
-        self._pre_tanh = float("nan")
         self._last = (0, 0.0)  # frame and seconds of the last row
 
     def episode(
@@ -141,6 +140,7 @@ class Outputs:
         seconds: float,
         episode: int,
         *,
+        pre_tanh: float,
         distance: float | None,
         filmed: dict[str, np.ndarray],
     ) -> str:
@@ -151,8 +151,9 @@ class Outputs:
           frame: of the run.
           seconds: of the run.
           episode: training episodes so far.
+          pre_tanh: the actor's mean |pre-tanh|; NaN before the first update.
           distance: to the expert, relative to a random policy; None if unknown.
-          filmed: arrays to keep beside the video, see `train.Run.explain`.
+          filmed: arrays to keep beside the video, see `Evaluator.explain`.
 
         Returns:
           One line for people.
@@ -163,7 +164,7 @@ class Outputs:
             "episode": episode,
             "task_return_mean": evaluation.mean,
             "task_return_std": evaluation.std,
-            "actor_pre_tanh": self._pre_tanh,
+            "actor_pre_tanh": pre_tanh,
         }
         if self._expert_return is not None:
             row["expert_task_return_mean"] = self._expert_return
@@ -186,9 +187,9 @@ class Outputs:
         )
         if self._expert_return is not None:
             line += f", the expert's {self._expert_return:.1f}"
-        if self._pre_tanh > _SATURATED:
+        if pre_tanh > _SATURATED:
             line += (
-                f"; the actor saturates (mean |pre-tanh| {self._pre_tanh:.1f}): raise "
+                f"; the actor saturates (mean |pre-tanh| {pre_tanh:.1f}): raise "
                 "pre_tanh_penalty if the return stays flat"
             )
         return line
@@ -201,7 +202,6 @@ class Outputs:
     def _write_training(
         self, frame: int, seconds: float, episode: int, values: Mapping[str, Any]
     ) -> None:
-        self._pre_tanh = values.get("actor/pre_tanh", self._pre_tanh)
         row = {"frame": frame, "seconds": round(seconds, 3), "episode": episode}
         row |= values
         with writes_to(self._workdir):

@@ -8,7 +8,7 @@ import pytest
 from jaxil import config as jaxil_config
 from jaxil.demonstrations.loading import Demonstrations
 from jaxil.environments.evaluation import Evaluation
-from jaxil.environments.interaction import FinishedEpisode
+from jaxil.maths.types import Episode
 from jaxil.training import expert_distance
 
 SIDE = 20
@@ -22,7 +22,7 @@ def draw(seed, count):
 def episode(frames):
     steps = len(frames) - 1
     zeros = np.zeros(steps, np.float32)
-    return FinishedEpisode(frames, np.zeros((steps, 1), np.float32), zeros, zeros)
+    return Episode(frames, np.zeros((steps, 1), np.float32), zeros, zeros)
 
 
 def demonstrations(*episodes):
@@ -38,7 +38,7 @@ def demonstrations(*episodes):
 def small_config():
     config = jaxil_config.default_config("pdac", "cartpole_swingup")
     config.image_size = SIDE
-    config.action_repeat = 50  # 20 decisions in an episode
+    config.action_repeat = 50  # 20 steps in an episode
     config.render_quality = "fast"
     return config
 

@@ -1,7 +1,7 @@
-"""Whole runs whose frames lie on the device, or whose updates go there in groups.
+"""Whole runs that are killed, stopped and resumed, in every way of learning.
 
 The environment is a drawing that moves with the actions, so that nothing is simulated.
-Most of the time goes into compiling: 35 s of a core.
+Most of the time goes into compiling: a minute of a core.
 """
 
 import functools
@@ -19,16 +19,18 @@ from jaxil import config as jaxil_config
 from jaxil import train
 from jaxil.demonstrations.loading import Demonstrations
 from jaxil.files.tables import read_csv
-from jaxil.training import assembly
-from tests.test_train import InProcessPool
+from jaxil.maths.types import Episode
+from jaxil.training import agent as agents
+from jaxil.training import assembly, learning_curve, parts
+from tests.environments.counting import InTurn
 
 SIDE, STEPS, EPISODES = 12, 21, 5
-REAL_MAKE_AGENT = assembly.make_agent
+REAL_MAKE_AGENT = agents.make_agent
 CLOCKS = ("seconds", "frames_per_second", "reward_seconds")
 
 
 class Drawing:
-    """Episodes of 21 decisions, in which a square goes where the actions lead it."""
+    """Episodes of 21 steps, in which a square goes where the actions lead it."""
 
     episode_steps = STEPS
 
@@ -84,8 +86,9 @@ def make_config(method, **changes):
     )
     config.encoder.channels = (4, 4)
     config.encoder.kernel_sizes, config.encoder.strides = (3, 3), (2, 1)
-    config.discriminator.batch_size = config.cloning.batch_size = 4
-    config.discriminator.hidden_dim = 16
+    sizes = {"batch_size": 4, "hidden_dim": 16}
+    for section in {"discriminator", "cloning"} & set(config):
+        config[section].update({n: sizes[n] for n in sizes if n in config[section]})
     config.update(changes)
     return config
 
@@ -115,23 +118,32 @@ def make_agent(method):
 
 @pytest.fixture(autouse=True)
 def _nothing_is_simulated(monkeypatch):
-    monkeypatch.setattr(assembly, "environment_with_seed", lambda *_: Drawing())
-    monkeypatch.setattr(assembly, "make_agent", lambda c, *_: make_agent(c.method))
-    monkeypatch.setattr(assembly, "training_pool", lambda c, *_: make_pool(c))
-    closeness = types.SimpleNamespace(relative_distance=lambda episodes: None)
-    monkeypatch.setattr(train, "Closeness", lambda *_: closeness)
-
-
-def make_pool(config):
-    drawings = [Drawing() for _ in range(config.num_environments)]
-    return InProcessPool(drawings) if len(drawings) > 1 else None
+    monkeypatch.setattr(assembly, "make_environment", lambda *_, **__: Drawing())
+    monkeypatch.setattr(
+        assembly, "Pool", lambda make, size, say: InTurn([make() for _ in range(size)])
+    )
+    monkeypatch.setattr(agents, "make_agent", lambda c, *_: make_agent(c.method))
+    monkeypatch.setattr(learning_curve, "plot", lambda *_, **__: None)  # slow
+    distance = types.SimpleNamespace(relative_distance=lambda episodes: None)
+    monkeypatch.setattr(parts, "Closeness", lambda *_: distance)
 
 
 def make_run(folder, method="dac", **changes):
     folder.mkdir(exist_ok=True)
-    return train.Run(
-        make_config(method, **changes), folder, make_demonstrations(), print
-    )
+    config = make_config(method, **changes)
+    return train.Run(**parts.make_parts(config, folder, make_demonstrations(), print))
+
+
+def act_until(run, num_steps):
+    """Makes a run stop at an agent step: a kill unless it is finished afterwards."""
+    act = run.act
+
+    def act_and_stop(observations):
+        run.stop_asked |= run.counters.num_steps >= num_steps
+        return act(observations)
+
+    run.act = act_and_stop
+    return run
 
 
 def finished(run):
@@ -140,27 +152,24 @@ def finished(run):
     return run
 
 
-def assert_same(run, other, tmp_path):
+def assert_same(run, other, tmp_path, *names):
     """Compares the tables, clocks left out, and what was learned."""
-    ours, theirs = (read_csv(tmp_path / f / "train.csv") for f in (run, other))
-    assert len(ours["frame"]) == EPISODES
-    for column in set(theirs) - set(CLOCKS):
-        np.testing.assert_array_equal(ours[column], theirs[column], column)
-
-
-def assert_same_params(run, other):
+    for table in ("train.csv", "eval.csv"):
+        ours, theirs = (read_csv(tmp_path / name / table) for name in names)
+        assert table == "eval.csv" or len(theirs["frame"]) == EPISODES
+        for column in set(theirs) - set(CLOCKS):
+            np.testing.assert_array_equal(ours[column], theirs[column], column)
     leaves = [jax.tree.leaves(r.state.params) for r in (run, other)]
     for ours, theirs in zip(*leaves, strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
 
 def test_frames_on_the_device_change_no_number(tmp_path):
-    # DAC draws all that there is to draw: windows, experts, and their actions.
+    # DAC samples all that there is to sample: windows, experts, and their actions.
     here = finished(make_run(tmp_path / "here"))
     there = finished(make_run(tmp_path / "there", replay_on_device=True))
     assert there.state.num_updates == STEPS * (EPISODES - 1) == 84
-    assert_same("there", "here", tmp_path)
-    assert_same_params(there, here)
+    assert_same(there, here, tmp_path, "there", "here")
     assert _compilations(there.agent.update_step) == 2  # one of each run
 
 
@@ -190,24 +199,16 @@ def test_groups_of_updates_end_with_the_episode_and_resume_bit_for_bit(tmp_path)
     # Metrics wait on the device until an episode is written down.
     assert set(read) == {STEPS * episode for episode in range(2, EPISODES + 1)}
 
-    broken = make_run(tmp_path / "broken", **changes)
-    act = broken.act
-
-    def act_until_killed(observation):
-        # In the middle of a group, half an episode after a checkpoint.
-        broken.stop_asked = broken.counters.num_steps == 2 * STEPS + 9
-        return act(observation)
-
-    broken.act = act_until_killed
+    # In the middle of a group, half an episode after a checkpoint.
+    broken = act_until(make_run(tmp_path / "broken", **changes), 2 * STEPS + 9)
     broken.loop()  # and no `finish`, as after a kill
-    broken.outputs.close()
+    broken.log.close()
     resumed = make_run(tmp_path / "broken", **changes)
     assert resumed.counters.num_steps == 2 * STEPS
-    assert_mirrored(resumed)
+    assert_copied(resumed)
     finished(resumed)
-    assert_mirrored(resumed)
-    assert_same("broken", "unbroken", tmp_path)
-    assert_same_params(resumed, unbroken)
+    assert_copied(resumed)
+    assert_same(resumed, unbroken, tmp_path, "broken", "unbroken")
     assert _compilations(resumed.agent.repeated_step) == compiled
 
 
@@ -221,23 +222,87 @@ def test_several_environments_resume_bit_for_bit_and_count_as_one(tmp_path):
     # One environment has learned since its first episode, two since their first ones.
     assert unbroken.state.num_updates == STEPS * (EPISODES - 2)
 
-    broken = make_run(tmp_path / "broken", **changes)
-    act = broken.act_together
-
-    def act_until_killed(observations):
-        broken.stop_asked = broken.counters.num_steps == 2 * STEPS + 18
-        return act(observations)
-
-    broken.act_together = act_until_killed
+    broken = act_until(make_run(tmp_path / "broken", **changes), 2 * STEPS + 18)
     broken.loop()  # and no `finish`, as after a kill
-    broken.outputs.close()
+    broken.log.close()
     assert broken.counters.num_steps == 2 * STEPS + 20
     resumed = make_run(tmp_path / "broken", **changes)
     assert resumed.counters.num_steps == 2 * STEPS
     finished(resumed)
-    assert_same("broken", "unbroken", tmp_path)
-    assert_same_params(resumed, unbroken)
-    assert _compilations(resumed.agent.explore_together) == 1
+    assert_same(resumed, unbroken, tmp_path, "broken", "unbroken")
+
+
+@pytest.mark.parametrize("num_environments", [1, 2])
+def test_a_run_that_is_stopped_again_and_again_is_that_of_an_unbroken_one(
+    tmp_path, num_environments
+):
+    # Every third step, so that a stop may fall between an episode's last update and its
+    # end. Rewards are refreshed between two stops.
+    changes: Any = {
+        "method": "pdac",
+        "num_environments": num_environments,
+        "update_every_steps": 3,
+        "reward_refresh_steps": STEPS + 5,
+        "eval_every_frames": 2 * STEPS,
+    }
+
+    def begin():
+        return make_run(tmp_path / "broken", **changes)
+
+    def stop_at(num_steps):
+        run = finished(act_until(begin(), num_steps))
+        assert run.player.open_episodes
+
+    def stop_in_evaluation():
+        run = begin()
+        evaluation, taken = run.evaluator.environment, []
+        step = evaluation.step
+
+        def step_and_stop(action):
+            taken.append(action)
+            run.stop_asked |= len(taken) == 9
+            return step(action)
+
+        evaluation.step = step_and_stop
+        assert finished(run).counters.owes_evaluation
+
+    unbroken = finished(make_run(tmp_path / "unbroken", **changes))
+    stop_at(10)
+    stop_in_evaluation()
+    stop_in_evaluation()  # in the second attempt
+    killed = begin()
+    killed.evaluate()  # its row is written, and no checkpoint
+    killed.log.close()
+    for num_steps in (59, 60, EPISODES * STEPS - 2):
+        stop_at(num_steps)
+    resumed = finished(begin())
+    assert_same(resumed, unbroken, tmp_path, "broken", "unbroken")
+    for number in unbroken.replay.episodes:
+        ours, theirs = (run.replay.rewards(number) for run in (resumed, unbroken))
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_refreshed_rewards_are_those_of_now(tmp_path):
+    run = make_run(tmp_path, "pdac", reward_refresh_steps=1, update_every_steps=3)
+    refreshed, refresh = [], run.updates.refresh_rewards
+
+    def counting_refresh(state):
+        refreshed.append(run.counters.num_steps)
+        refresh(state)
+
+    run.updates.refresh_rewards = counting_refresh
+    finished(run)
+    assert refreshed == [STEPS * number for number in range(1, EPISODES + 1)]
+    assert len(run.replay.episodes) == 2
+    for number in run.replay.episodes:
+        stored = run.replay.episode(number)
+        unknown = np.full(STEPS, np.nan, np.float32)
+        episode = Episode(stored.frames, stored.actions, unknown, unknown)
+        rewards = run.agent.rewards(
+            run.state.rewarder, run.state.params, episode, run.experts
+        )
+        np.testing.assert_allclose(run.replay.rewards(number), rewards, rtol=1e-5)
+    assert np.ptp(run.replay.rewards(number)) > 0
 
 
 def test_actions_of_several_are_those_of_each_with_noise_of_its_own_step(tmp_path):
@@ -246,23 +311,23 @@ def test_actions_of_several_are_those_of_each_with_noise_of_its_own_step(tmp_pat
     seen = np.stack([d.reset(n).observation for n, d in enumerate(drawings)])
     for first in (4, 9, 20):  # uniform, both, the policy's
         run.counters.num_steps = first
-        together = run.act_together(seen)
-        for place, observation in enumerate(seen):
-            run.counters.num_steps = first + place
-            alone = run.act(observation)
-            np.testing.assert_allclose(together[place], alone, rtol=0, atol=1e-5)
+        together = run.act(seen)
+        for index, observation in enumerate(seen):
+            run.counters.num_steps = first + index
+            alone = run.act(observation[None])
+            np.testing.assert_allclose(together[index], alone[0], rtol=0, atol=1e-5)
     assert len(np.unique(together)) == together.size
     # Fewer than there may be, at a run's end, act alike.
     run.counters.num_steps = 20
-    np.testing.assert_array_equal(run.act_together(seen[:2]), together[:2])
-    run.outputs.close()
+    np.testing.assert_array_equal(run.act(seen[:2]), together[:2])
+    run.log.close()
 
 
-def assert_mirrored(run):
-    replay = run.replay
-    for number in range(replay.oldest_episode, replay.num_episodes_added):
-        slots, frames = replay.slots(number), replay.episode(number).frames
-        np.testing.assert_array_equal(run.updates._mirror.frames[slots], frames)
+def assert_copied(run):
+    replay, copied = run.replay, np.asarray(run.updates.frames().agent)
+    for number in replay.episodes:
+        frames = replay.episode(number).frames
+        np.testing.assert_array_equal(copied[replay.slots(number)], frames)
 
 
 class Reading:
@@ -283,8 +348,8 @@ def _compilations(step: Any) -> int:
 def test_settings_of_speed_are_checked_at_the_door():
     config = jaxil_config.default_config("pdac", "walker_walk")
     config.update(updates_per_dispatch=0, compute_dtype="float16", num_environments=65)
-    faults = jaxil_config.problems(config, ("walker_walk",))
-    assert len(faults) == 3
-    assert "compute_dtype='float16' is unknown; choose one of: float32" in faults[0]
-    assert "updates_per_dispatch=0 must lie in [1, 1000]" in faults[1]
-    assert "num_environments=65 must lie in [1, 64]" in faults[2]
+    said = [str(each) for each in jaxil_config.problems(config, ("walker_walk",))]
+    assert len(said) == 3
+    assert "updates_per_dispatch=0 must lie in [1, 1000]" in said[0]
+    assert "num_environments=65 must lie in [1, 64]" in said[1]
+    assert "compute_dtype='float16' is unknown; choose one of: float32" in said[2]
