@@ -62,7 +62,7 @@ class Variant(NamedTuple):
             for field, (_, name) in _CHANGES.items()
             if field in self.overrides
         ]
-        return ", ".join([METHOD_NAMES[self.method], *words])
+        return ", ".join([METHOD_NAMES.get(self.method, self.method), *words])
 
     @property
     def slug(self) -> str:
