@@ -28,6 +28,7 @@ class TrainingDiverged(RuntimeError):
     """A loss or reward is no longer a finite number."""
 
 
+@dataclasses.dataclass(eq=False)
 class Run(Parts):
     """One training run: its parts, its state, and what happens to them in order."""
 
