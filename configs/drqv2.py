@@ -1,4 +1,6 @@
-r"""DrQ-v2 from pixels on the true reward: the backbone, and the paper's experts.
+r"""DrQ-v2 from pixels on the true reward: the backbone.
+
+The paper's experts are runs of this learner, whose exact settings it does not give.
 
 python -m jaxil.launch --config=configs/drqv2.py:cheetah_run --workdir=runs/drqv2
 """

@@ -1,6 +1,6 @@
 r"""P-SIL on walker_walk from ten pixel demonstrations, as in the paper.
 
-    python -m jaxil.launch --config=configs/pdac_walker.py --workdir=runs/psil
+    python -m jaxil.launch --config=configs/psil_walker.py --workdir=runs/psil
 
 Change one thing from the command line:
 

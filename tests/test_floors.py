@@ -11,17 +11,15 @@ ROOT = pathlib.Path(__file__).parent.parent / "jaxil"
 # from itself. What is not named here is a command, on top of all.
 FLOORS = {
     "errors": 0,
-    **dict.fromkeys(("maths", "machine", "files"), 1),
+    **dict.fromkeys(("methods", "maths", "machine", "files"), 1),
     **dict.fromkeys(("native", "replay"), 2),
     **dict.fromkeys(("networks", "environments"), 3),
     **dict.fromkeys(("learner", "demonstrations"), 4),
     "rewarders": 5,
-    "methods": 6,
     "config": 7,
-    "command": 8,
     "reporting": 8,
     "training": 9,
-    "train": 10,
+    **dict.fromkeys(("command", "train"), 10),
     "timing": 11,
 }
 TOP = 12

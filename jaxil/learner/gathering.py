@@ -1,4 +1,4 @@
-"""Stacks of frames, put together on the device from the frames that lie there."""
+"""Stacks of frames, gathered on the device from the frames that are there."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -15,7 +15,7 @@ Step = Callable[..., tuple[TrainState, Metrics]]
 
 
 class Frames(NamedTuple):
-    """All frames that batches are drawn from, on the device.
+    """All frames that batches are sampled from, on the device.
 
     Attributes:
       agent: those of the replay, uint8 [N, H, W, 3] or float32 [N, S]; None for a
@@ -28,20 +28,20 @@ class Frames(NamedTuple):
     expert: Data | None
 
 
-def gather_stacks(frames: Data, slots: Data) -> Array:
+def gather_stacks(frames: Data, indices: Data) -> Array:
     """Gathers frames and folds each stack of them into the channels.
 
     Args:
       frames: shape [N, H, W, C], or [N, S] if F is 1.
-      slots: int32 [..., F] in [0, N): the frames of each stack, the oldest first.
+      indices: int32 [..., F] in [0, N): the frames of each stack, the oldest first.
 
     Returns:
       Shape [..., H, W, F * C], or [..., S].
     """
     chex.assert_rank(frames, {2, 4})
-    gathered = jnp.asarray(frames).at[slots].get(mode="promise_in_bounds")
+    gathered = jnp.asarray(frames).at[indices].get(mode="promise_in_bounds")
     if frames.ndim == 2:
-        chex.assert_axis_dimension(slots, -1, 1)
+        chex.assert_axis_dimension(indices, -1, 1)
         return jnp.squeeze(gathered, -2)
     # [..., F, H, W, C] to [..., H, W, F, C], whose last two axes are the channels.
     gathered = jnp.moveaxis(gathered, -4, -2)
@@ -49,12 +49,12 @@ def gather_stacks(frames: Data, slots: Data) -> Array:
 
 
 def gather_batch(frames: Data, batch: Batch) -> Batch:
-    """Puts pixels in the place of slots.
+    """Replaces indices by pixels.
 
     Args:
       frames: see `gather_stacks`.
-      batch: as the replay's `sample_indices` draws it: observations int32 [B, F], those
-        of a window [B, n, F].
+      batch: as the replay's `sample_indices` returns it: observations int32 [B, F],
+        those of a window [B, n, F].
     """
     window = batch.window
     if window is not None:
@@ -71,11 +71,11 @@ def gather_batch(frames: Data, batch: Batch) -> Batch:
 
 
 def gather_expert(frames: Data, expert: ExpertBatch) -> ExpertBatch:
-    """Puts pixels in the place of slots.
+    """Replaces indices by pixels.
 
     Args:
       frames: of whole episodes, see `Frames.expert`.
-      expert: observations int32 [B, F], places in the episodes laid end to end.
+      expert: observations int32 [B, F], indices into the episodes laid end to end.
     """
     chex.assert_rank(frames, {3, 5})
     row = jnp.asarray(frames).reshape(-1, *frames.shape[2:])
@@ -88,11 +88,11 @@ def gather_expert(frames: Data, expert: ExpertBatch) -> ExpertBatch:
 
 
 def make_gathering_step(step: Step) -> Step:
-    """Returns a learning step that may be told where the frames lie.
+    """Returns a learning step for batches with or without their pixels.
 
-    (state, batch, expert, frames) -> (state, metrics). With frames, batches hold slots
-    in the place of pixels, see `gather_batch` and `gather_expert`; without, they are
-    those that `step` takes.
+    (state, batch, expert, frames) -> (state, metrics). With frames, batches hold their
+    indices, see `gather_batch` and `gather_expert`; without, they are those that `step`
+    takes.
 
     Args:
       step: the learning step, (state, batch, expert) -> (state, metrics).
@@ -109,8 +109,8 @@ def make_gathering_step(step: Step) -> Step:
         if frames is not None and expert is not None:
             expert = gather_expert(frames.expert, expert)
         if frames is not None:
-            # Without it, XLA may fuse what follows with the gathering, sum in another
-            # order, and where frames lie would change the numbers of a run.
+            # Without it, XLA may fuse what follows with the gathering and sum in
+            # another order: a run's numbers would depend on where its frames are.
             batch, expert = jax.lax.optimization_barrier((batch, expert))
         return step(state, batch, expert)
 
@@ -120,8 +120,7 @@ def make_gathering_step(step: Step) -> Step:
 def make_repeated_step(step: Step) -> Step:
     """Returns a step that makes n updates in one call.
 
-    Its batches have one axis more, of length n, in front; its metrics are those of the
-    last update.
+    Its batches have a first axis of length n; its metrics are those of the last update.
 
     Args:
       step: as `make_gathering_step` returns it.
@@ -133,8 +132,8 @@ def make_repeated_step(step: Step) -> Step:
         expert: ExpertBatch | None,
         frames: Frames | None = None,
     ) -> tuple[TrainState, Metrics]:
-        def update(state: TrainState, drawn: tuple) -> tuple[TrainState, Metrics]:
-            return step(state, *drawn, frames)
+        def update(state: TrainState, sampled: tuple) -> tuple[TrainState, Metrics]:
+            return step(state, *sampled, frames)
 
         state, metrics = jax.lax.scan(update, state, (batch, expert))
         return state, jax.tree.map(lambda values: values[-1], metrics)

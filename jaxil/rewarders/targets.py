@@ -159,5 +159,7 @@ def make_target_rewarder(
         matches_episodes=True,
         rewards_changed=lambda state: state.steps_since_copy == 0,
         plan=None if plan is None else plan_of,
-        summary=lambda state: {"sinkhorn/scale": state.scale},
+        summary=lambda state: (
+            {} if return_scale is None else {"sinkhorn/scale": state.scale}
+        ),
     )
