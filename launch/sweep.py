@@ -29,7 +29,7 @@ from jaxil.errors import Fault, UsageError  # noqa: E402
 from jaxil.machine import startup  # noqa: E402
 from jaxil.reporting import figures  # noqa: E402
 from jaxil.training import workdir  # noqa: E402
-from launch.sweeps import clusters, cost, plan, state, tables  # noqa: E402
+from launch.sweeps import clusters, plan, state, tables  # noqa: E402
 from launch.sweeps.state import Run, State, Status  # noqa: E402
 
 Statuses = dict[Run, Status]
@@ -66,10 +66,14 @@ def main(argv: list[str]) -> int:
     ]
     tables.print_plan(statuses)
     if todo:
-        guess = cost.guessed_speed(values.preset, on_gpu=cluster.uses_gpus)
-        at_once = clusters.num_at_once(cluster, len(todo))
-        open_runs = {run: statuses[run] for run in todo}
-        print(cost.estimate(open_runs, statuses, at_once, guess))
+        told = tables.estimate(
+            {run: statuses[run] for run in todo},
+            statuses,
+            num_at_once=clusters.num_at_once(cluster, len(todo)),
+            preset=values.preset,
+            on_gpu=cluster.uses_gpus,
+        )
+        print(told)
     else:
         print("Nothing is left to start.")
     if values.dry_run:

@@ -14,7 +14,7 @@ from jaxil.errors import Fault, UsageError
 from jaxil.files import locking
 from jaxil.files.tables import read_csv
 from jaxil.training import workdir
-from launch.sweeps import clusters, cost, plan, state, tables
+from launch.sweeps import clusters, plan, state, tables
 from launch.sweeps.clusters import Cluster
 from launch.sweeps.state import State, Status
 from tests.commands import ROOT, SMALL
@@ -372,12 +372,13 @@ def test_cost_by_hand(tmp_path):
         other: Status(State.MISSING),
     }
     todo = {run: statuses[run] for run in (two, three, other)}
-    # two goes on at its own 50 frames/s, three at the median 75, other at the guess:
-    # 120 s, 133 s and 1000 s.
-    told = cost.estimate(todo, statuses, num_at_once=2, guess=10.0)
-    assert told.startswith("Left to do: 26,000 frames, 0.3 hours of runs; about 17 min")
-    assert "with 2 at a time (a guess: 10 frames/s for drqv2" in told
-    assert "about 21 min with 1" in cost.estimate(todo, statuses, 1, 10.0)
+    # two and three go on at the median 75 frames/s, other at the guess of 40: 80 s,
+    # 133 s and 250 s.
+    told = tables.estimate(todo, statuses, num_at_once=9, preset="tiny", on_gpu=False)
+    assert told.startswith("Left to do: 26,000 frames, 0.1 hours of runs; about 4 min")
+    assert "with 9 at a time (a guess: 40 frames/s for drqv2" in told
+    told = tables.estimate(todo, statuses, num_at_once=1, preset="tiny", on_gpu=False)
+    assert "about 8 min with 1" in told
 
 
 # Runs on this machine, done by a stand-in for the training.
