@@ -172,8 +172,7 @@ def test_a_sweep_of_real_runs_survives_a_requeue(tmp_path):
     _output("scontrol", "requeue", job)
     watch = [*arguments, "--watch"]
     _wait_for_requeued(job, lambda: "1 finished" in _run(watch), seconds=400)
-    assert "going on from the checkpoint" in (home / "log.txt").read_text()
-    # The episode that was cut off is dropped, so frames are no round numbers.
+    assert "resuming from the checkpoint" in (home / "log.txt").read_text()
     table = read_csv(home / "train.csv")
     assert list(table["episode"]) == list(range(len(table["episode"])))
     assert np.all(np.diff(table["frame"]) >= 1000)

@@ -220,7 +220,10 @@ def test_slurm_commands_without_a_cluster_are_no_slurm(tmp_path, monkeypatch):
 
 
 def test_wrong_use_of_the_command_ends_with_status_2(tmp_path):
-    done = _sweep("--methods=gail", "--seeds=0", "--cluster=pbs", "--tasks=walker_wlak")
+    done = _sweep(
+        *("--methods=gail", "--seeds=0", "--cluster=pbs", "--tasks=walker_wlak"),
+        *("--config.bath_size", "8"),
+    )
     assert done.returncode == 2
     for words in (
         "gail",
@@ -511,11 +514,12 @@ clusters.start(clusters.Cluster("local", num_workers=1), runs, folder, lambda: N
 
 
 def _start(runs, folder: pathlib.Path) -> subprocess.Popen:
-    """Starts a local sweep as a process group of its own."""
+    """Starts a local sweep as a process group of its own, which ignores SIGHUP."""
     (folder / "runs").write_bytes(pickle.dumps(runs))
     return subprocess.Popen(
-        [sys.executable, "-c", _SWEEP, str(folder)],
+        ["nohup", sys.executable, "-c", _SWEEP, str(folder)],
         cwd=ROOT,
+        stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
