@@ -231,6 +231,7 @@ def test_wrong_use_of_the_command_ends_with_status_2(tmp_path):
         "'pbs'",
         "--workdir is missing or empty",
         "walker_walk",
+        "'bath_size'",
     ):
         assert words in done.stderr
     assert "Traceback" not in done.stderr
