@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import pathlib
 import time
-from typing import Any
 
 import jax
 import numpy as np
@@ -34,7 +33,6 @@ class Run(Parts):
 
     def __post_init__(self) -> None:
         self.stop_asked = False
-        self.metrics: dict[str, Any] = {}  # of the last update
         self.returns: dict[str, float] = {}  # of the last episode, for the terminal
         self.started = time.monotonic() - self.counters.seconds
         self.exploration_key = jax.random.fold_in(
@@ -55,8 +53,8 @@ class Run(Parts):
         """Trains until the budget is used up, or until someone asks to stop.
 
         Args:
-          whole_episodes: whether episodes that are under way when the budget ends are
-            played to their end, so that they count and the last evaluation takes place.
+          whole_episodes: whether episodes that are open when the budget ends are played
+            to their end, so that they count and the last evaluation takes place.
 
         Raises:
           EnvironmentsFailed: there are several, and they cannot go on.
@@ -67,13 +65,13 @@ class Run(Parts):
         learn = self.stopwatch.timed("update", self.learn)
         if counters.owes_evaluation:
             self.evaluate()
+            self.save()
         # Collected updates run before a stop: fewer at once would act differently.
         while not self.stop_asked or self.updates.is_pending:
             if player is not None:
                 player.begin(self.wants_episode)
-            if not self.is_playing and self.frame >= config.total_frames:
-                break
-            if not whole_episodes and self.frame >= config.total_frames:
+            is_spent = self.frame >= config.total_frames
+            if is_spent and not (self.is_playing and whole_episodes):
                 break
             if player is None:
                 learn(config.update_every_steps)
@@ -102,14 +100,10 @@ class Run(Parts):
         assert self.player is not None
         left = self.player.steps_left(self.episode_steps)
         planned = self.frame + left * self.config.action_repeat
-        return planned < self.config.total_frames and not self.stop_asked
+        return planned < self.config.total_frames
 
     def act(self, observations: np.ndarray) -> np.ndarray:
-        """Returns exploring actions [E, A]; uniform at first.
-
-        Args:
-          observations: one of each environment that plays, [E, ...].
-        """
+        """Returns exploring actions [E, A] for observations [E, ...]."""
         count, size = len(observations), self.config.num_environments
         steps = self.counters.num_steps + np.arange(size, dtype=np.uint32)
         uniform = steps[:count] < self.config.exploration_steps
@@ -145,10 +139,10 @@ class Run(Parts):
                     self.flush()
 
     def update_is_due(self, before: int) -> bool:
-        """Returns whether the learner steps after this agent step.
+        """Returns whether an agent step is followed by an update.
 
         Args:
-          before: frames before it.
+          before: frames before that step.
         """
         if self.counters.num_steps % self.config.update_every_steps:
             return False
@@ -160,7 +154,7 @@ class Run(Parts):
         """Makes the updates that are collected."""
         self.state, metrics = self.updates.run(self.state)
         if metrics is not None:
-            self.metrics = metrics
+            self.counters.metrics = metrics
 
     def store(self, episode: Episode, *, later: list[Episode]) -> None:
         """Rewards a finished episode and stores it; refreshes rewards where due.
@@ -185,7 +179,9 @@ class Run(Parts):
         self.stopwatch.reward_seconds += seconds
         self.stopwatch.seconds["update"] += seconds
 
-        metrics = {**self.metrics, **self.agent.rewarder.summary(self.state.rewarder)}
+        metrics = self.counters.metrics | self.agent.rewarder.summary(
+            self.state.rewarder
+        )
         metrics = {name: float(value) for name, value in metrics.items()}
         metrics["replay/reward"] = self.replay.mean_reward()
         self.require_finite(metrics)
@@ -250,8 +246,9 @@ class Run(Parts):
         """Plays evaluation episodes with the mean action and writes them down."""
         self.flush()
         counters = self.counters
-        if self.player is None:  # no episode has written these
-            metrics = {name: float(value) for name, value in self.metrics.items()}
+        if self.player is None and not counters.owes_evaluation:
+            # No episode has written these.
+            metrics = {name: float(value) for name, value in counters.metrics.items()}
             self.require_finite(metrics)
             seconds = time.monotonic() - self.started
             self.log.updates(frame=self.frame, seconds=seconds, metrics=metrics)
@@ -283,11 +280,13 @@ class Run(Parts):
         self.counters.last_checkpoint_step = self.counters.num_steps
         self.counters.seconds = time.monotonic() - self.started
         open_episodes = {} if self.player is None else self.player.open_episodes
+        metrics = self.counters.metrics
         self.checkpoints.save(
             frame=self.frame,
             learner_state=self.state,
             counters={
-                **dataclasses.asdict(self.counters),
+                **vars(self.counters),
+                "metrics": {name: float(value) for name, value in metrics.items()},
                 "open_episodes": {n: a.tolist() for n, a in open_episodes.items()},
             },
             replay=self.replay,
@@ -339,7 +338,6 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
       TrainingDiverged: a loss or reward is not finite any more.
       EnvironmentsFailed: there are several, and they cannot go on.
     """
-
     demonstrations = assembly.load_demonstrations(config)
     method = methods.get(config.method)
     screen.say(f"{config.task}: {method.label}, {method.about}; seed {config.seed}")

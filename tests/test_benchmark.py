@@ -11,7 +11,7 @@ import pytest
 
 from jaxil import benchmark
 from jaxil import config as jaxil_config
-from jaxil.command import UsageError
+from jaxil.errors import UsageError
 from jaxil.timing import measurement, start, tables
 from jaxil.timing.bench import Bench
 from tests.commands import SMALL, run

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from jaxil import collect
-from jaxil.command import UsageError
 from jaxil.demonstrations import foreign, inspection, loading, states
+from jaxil.errors import UsageError
 from tests.commands import ROOT, arguments, run
 from tests.demonstrations import foreign_files
 

@@ -8,9 +8,9 @@ import pytest
 
 from jaxil import config as jaxil_config
 from jaxil import doctor
-from jaxil.command import UsageError
 from jaxil.demonstrations import states
 from jaxil.environments import pixel_environment, suite
+from jaxil.errors import UsageError
 from jaxil.machine import devices, memory
 
 

@@ -131,7 +131,7 @@ def test_a_method_from_outside_is_planned(tmp_path, monkeypatch, preset):
     runs = _runs(
         tmp_path, methods=["outsider:METHOD"], preset=preset, overrides=overrides
     )
-    assert runs[0].name == "cartpole_swingup/outsider.METHOD/seed0"
+    assert runs[0].name == "cartpole_swingup/outsider_METHOD/seed0"
     config = _config(runs[-1])
     assert (config.method, config.task) == ("outsider:METHOD", "walker_run")
     assert config.own.strength == 2.5

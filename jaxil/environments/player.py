@@ -48,9 +48,14 @@ class InProcess:
 
 @dataclasses.dataclass
 class _Open:
-    """An episode that is being played, so far."""
+    """An episode that is being played, so far.
+
+    Attributes:
+      repeated: actions with which it begins, of an earlier process.
+    """
 
     number: int
+    repeated: np.ndarray
     observation: np.ndarray | None = None
     is_last: bool = False
     frames: list[np.ndarray] = dataclasses.field(default_factory=list)
@@ -117,14 +122,17 @@ class Player:
             if number == self._next_episode:
                 self._next_episode += 1
             self._environments.reset(index, number)
-            self._open[index] = _Open(number)
-            begun.append((index, self._waiting.pop(number, ())))
-        for index, actions in begun:
+            self._open[index] = _Open(number, self._waiting.pop(number, np.zeros(0)))
+            begun.append(index)
+        for index in begun:
+            actions = self._open[index].repeated
             self._receive(index)
             for action in actions:
                 if index in self._open:
                     self._step(index, action)
                     self._receive(index)
+        if begun and not self._open:  # all were lost
+            return self.begin(wanted)
         return bool(begun)
 
     @property
@@ -135,8 +143,8 @@ class Player:
 
     @property
     def is_playing(self) -> bool:
-        """Whether any episode is open."""
-        return bool(self._open)
+        """Whether any episode is open, or is to be played again."""
+        return bool(self._open or self._waiting)
 
     @property
     def open_episodes(self) -> dict[int, np.ndarray]:
@@ -146,7 +154,7 @@ class Player:
 
     def steps_left(self, episode_steps: int) -> int:
         """Returns the agent steps that open episodes of a length still need."""
-        played = [len(episode.actions) for episode in self._open.values()]
+        played = [max(len(e.actions), len(e.repeated)) for e in self._open.values()]
         return sum(max(episode_steps - steps, 0) for steps in played)
 
     def step(self, actions: np.ndarray) -> None:

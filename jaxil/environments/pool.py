@@ -41,7 +41,7 @@ def interrupts_blocked() -> Iterator[None]:
 
 
 class Pool:
-    """Environments in separate processes, for `interaction.interact_together`.
+    """Environments in separate processes, as `interaction.Environments`.
 
     A process that dies or does not answer is killed and replaced when the next episode
     starts. All of them end with this process, however that ends.

@@ -117,7 +117,9 @@ class Bench:
         """Updates as often as a run does in one dispatch; returns the new state."""
         run, agent = self._run, self._run.agent
         step = agent.repeated_step if self._several > 1 else agent.update_step
-        run.state, run.metrics = step(run.state, *self._on_device, run.updates.frames())
+        run.state, run.counters.metrics = step(
+            run.state, *self._on_device, run.updates.frames()
+        )
         return run.state
 
     def add_episode(self) -> None:

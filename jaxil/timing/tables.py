@@ -7,7 +7,7 @@ from typing import Any
 
 from flax.traverse_util import flatten_dict
 
-from jaxil.command import UsageError
+from jaxil.errors import UsageError
 
 # Section, then row and what it means.
 ROWS: dict[str, dict[str, str]] = {

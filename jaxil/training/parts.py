@@ -38,6 +38,7 @@ class Counters:
       last_checkpoint_step: agent step of the last checkpoint.
       last_refresh_step: agent step of the last recomputation of stored rewards.
       owes_evaluation: whether an evaluation was due when the run was stopped.
+      metrics: of the last update; for the next row of train.csv.
       seconds: wall-clock of the run, earlier processes included.
     """
 
@@ -48,6 +49,7 @@ class Counters:
     last_checkpoint_step: int = 0
     last_refresh_step: int = 0
     owes_evaluation: bool = False
+    metrics: dict[str, Any] = dataclasses.field(default_factory=dict)
     seconds: float = 0.0
 
 
@@ -146,7 +148,13 @@ def make_parts(
             config, agent, assembly.evaluation_environment(config), experts, distance
         ),
         checkpoints=checkpoints,
-        log=Outputs(workdir, config, demonstrations, frame if resumed else None),
+        log=Outputs(
+            workdir,
+            config,
+            demonstrations,
+            frame if resumed else None,
+            owes_evaluation=counters.owes_evaluation,
+        ),
         progress=ProgressLine(config.total_frames, first_frame=frame),
         stopwatch=stopwatch,
     )

@@ -64,17 +64,30 @@ class Outputs:
         config: Config,
         demonstrations: loading.Demonstrations | None,
         resume_frame: int | None,
+        *,
+        owes_evaluation: bool = False,
     ) -> None:
-        """Opens the tables; on a resume, rows after `resume_frame` are dropped."""
+        """Opens the tables.
+
+        Args:
+          workdir: the run's folder.
+          config: of the run.
+          demonstrations: what the method imitates, or None.
+          resume_frame: on a resume, rows of later frames are dropped.
+          owes_evaluation: whether the evaluation of that frame will be played again.
+        """
         self._workdir = workdir
         self._config = config
         own = methods.get(config.method).metrics
+        evaluated = resume_frame
+        if evaluated is not None and owes_evaluation:
+            evaluated -= 1
         with writes_to(workdir):
             self._train, self._evaluations = (
-                CsvLog(workdir / name, columns, resume_frame=resume_frame, say=say)
-                for name, columns in (
-                    ("train.csv", (*TRAIN_COLUMNS, *own)),
-                    ("eval.csv", EVAL_COLUMNS),
+                CsvLog(workdir / name, columns, resume_frame=frame, say=say)
+                for name, columns, frame in (
+                    ("train.csv", (*TRAIN_COLUMNS, *own), resume_frame),
+                    ("eval.csv", EVAL_COLUMNS, evaluated),
                 )
             )
             self._events = _Events(workdir / "tensorboard", resume_frame)

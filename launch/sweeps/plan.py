@@ -180,7 +180,7 @@ def _preset(preset: str, method: str, task: str) -> list[str]:
 
 def _seeds(request: Request, config: Config, words: list[str]) -> Iterator[Run]:
     # The settings decide on the name: --config.shift_padding=0 makes another variant.
-    slug = figures.variant_of(config.to_dict()).slug.replace(":", ".")
+    slug = figures.variant_of(config.to_dict()).slug
     for seed in range(request.num_seeds):
         folder = request.folder / config.task / slug / f"seed{seed}"
         own = (f"--config.seed={seed}", f"--workdir={folder}")

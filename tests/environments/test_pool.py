@@ -16,7 +16,7 @@ import dm_env
 import numpy as np
 import pytest
 
-from jaxil.environments.interaction import interact, interact_together, join
+from jaxil.environments.player import InProcess, Player
 from jaxil.environments.pool import EnvironmentsFailed, Pool
 from jaxil.environments.suite import make_environment
 
@@ -58,32 +58,20 @@ def without_jax(make):
     return environment
 
 
-def play(pool, num_episodes, act=lambda seen: seen[:, :1] % 10, each_round=None):
+def play(environments, num_episodes, act=lambda seen: seen[:, :1] % 10, each_round=None):
     """Plays whole episodes; returns them by number."""
-    under_way, whole, begun = {}, {}, set()
-
-    def begin(episode):
-        begun.add(episode)
-        return episode < num_episodes
-
-    for number, decisions in enumerate(
-        interact_together(pool, act, first_episode=0, begin=begin)
-    ):
-        assert number < 100, "it goes on and on"
-        episodes = [decision.episode for decision in decisions]
-        assert episodes == sorted(episodes)
-        if each_round is not None:
-            each_round(number, decisions)
-        for decision in decisions:
-            if decision.first_frame is not None:
-                under_way[decision.episode] = []
-            under_way[decision.episode].append(decision)
-            if decision.is_last:
-                assert decision.episode not in whole
-                whole[decision.episode] = join(under_way.pop(decision.episode))
-        if len(whole) == num_episodes:
+    player, whole = Player(environments, first_episode=0), {}
+    for number in range(100):
+        player.begin(lambda episode: episode < num_episodes)
+        if not player.is_playing:
             return whole
-    raise AssertionError
+        steps = {n: len(actions) for n, actions in player.open_episodes.items()}
+        player.step(act(player.observations))
+        ended = player.observe()
+        whole |= zip(sorted(set(steps) - set(player.open_episodes)), ended, strict=True)
+        if each_round is not None:
+            each_round(number, steps)
+    raise AssertionError("it goes on and on")
 
 
 def counting_pool(size, say=print, **seconds):
@@ -95,7 +83,7 @@ def assert_counted(episodes):
         times = np.arange(STEPS + 1)
         np.testing.assert_array_equal(episode.frames[:, 0], 10 * number + times)
         np.testing.assert_array_equal(episode.actions[:, 0], times[:-1])
-        np.testing.assert_array_equal(episode.task_rewards, times[:-1])
+        np.testing.assert_array_equal(episode.rewards, times[:-1])
         np.testing.assert_array_equal(episode.discounts, 0.5)
 
 
@@ -131,17 +119,11 @@ def test_episodes_are_those_of_a_single_environment():
     pool = Pool(functools.partial(without_jax, make), 2, say=print)
     with contextlib.closing(pool):
         found = play(pool, 3, act)
-    expected: list = [[]]
-    for decision in interact(single, lambda seen: act(seen[None])[0], first_episode=0):
-        expected[-1].append(decision)
-        if decision.is_last and len(expected) == 3:
-            break
-        if decision.is_last:
-            expected.append([])
+    expected = play(InProcess(single), 3, act)
     single.close()
-    assert sorted(found) == [0, 1, 2]
-    for number, decisions in enumerate(expected):
-        for ours, theirs in zip(found[number], join(decisions), strict=True):
+    assert sorted(found) == sorted(expected) == [0, 1, 2]
+    for number, episode in expected.items():
+        for ours, theirs in zip(found[number], episode, strict=True):
             np.testing.assert_array_equal(ours, theirs)
             assert ours.dtype == theirs.dtype
     assert np.ptp(found[0].frames) > 0
@@ -166,27 +148,28 @@ def test_several_processes_play_and_none_is_left():
 
 
 @pytest.mark.parametrize(
-    ("number", "said"),
+    ("sent", "said"),
     [(signal.SIGKILL, "was killed by SIGKILL"), (signal.SIGSTOP, "not answer for 3 s")],
 )
-def test_a_lost_process_is_replaced_and_its_episode_played_again(number, said):
+def test_a_lost_process_is_replaced_and_its_episode_played_again(sent, said):
     lines, rounds = [], []
     pool = counting_pool(2, lines.append, step_seconds=3.0)
     first_pids = pool.pids
 
-    def lose_one(count, decisions):
-        rounds.append([decision.episode for decision in decisions])
-        if count == 1:
-            os.kill(first_pids[0], number)
+    def lose_one(number, steps):
+        rounds.append(steps)
+        if number == 1:
+            os.kill(first_pids[0], sent)
 
     with contextlib.closing(pool):
         assert_counted(play(pool, 4, each_round=lose_one))
         assert pool.pids[1] == first_pids[1]
         assert pool.pids[0] != first_pids[0]
         assert not is_there(first_pids[0])
-    assert rounds[:4] == [[0, 1], [0, 1], [1], [0, 1]]
+    steps = [{0: 0, 1: 0}, {0: 1, 1: 1}, {0: 2, 1: 2}, {0: 0, 1: 3}]
+    assert rounds[:4] == steps
     (line,) = lines
-    assert f"environment 0 {'did ' * (number == signal.SIGSTOP)}{said}" in line
+    assert f"environment 0 {'did ' * (sent == signal.SIGSTOP)}{said}" in line
     assert "plays episode 0 from its start" in line
 
 

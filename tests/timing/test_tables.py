@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from jaxil.command import UsageError
+from jaxil.errors import UsageError
 from jaxil.timing import tables
 
 _OLD = {
