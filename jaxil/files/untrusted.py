@@ -1,4 +1,4 @@
-"""Other people's files: which ones are opened, and how their text is printed."""
+"""Untrusted files: what may be opened, and how their text is printed."""
 
 import os
 import pathlib
@@ -6,12 +6,10 @@ import stat
 
 
 def require_regular(path: str | os.PathLike, *, or_folder: bool = False) -> None:
-    """Raises ValueError for what must not be opened: pipes, devices, sockets.
-
-    Opening one could wait forever or fill the memory.
+    """Rejects pipes, devices and sockets, which could block or never end.
 
     Raises:
-      ValueError: the end of a sentence that begins with the file's name.
+      ValueError: not a regular file; continues a sentence that begins with its name.
       OSError: there is no such file.
     """
     mode = pathlib.Path(path).stat().st_mode

@@ -375,7 +375,7 @@ def test_a_header_that_promises_more_than_there_is(path):
     with zipfile.ZipFile(path, "w") as changed:
         for name, content in members.items():
             changed.writestr(name, content)
-    with pytest.raises(DemonstrationError, match="qpos that is not as long as it says"):
+    with pytest.raises(DemonstrationError, match="qpos whose header claims"):
         states.read_states(path)
 
 

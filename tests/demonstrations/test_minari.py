@@ -338,7 +338,7 @@ def test_usual_packing_is_read(path, packing):
 def test_more_than_the_limit_is_refused_and_the_limit_itself_is_not(path):
     largest = EPISODES[1]["observations"].nbytes
     assert len(read(path, max_bytes=largest)[1]) == 2
-    message = f"{largest} bytes, more than the {largest - 1} that are accepted"
+    message = f"{largest} bytes, more than the {largest - 1} allowed"
     with pytest.raises(FormatError, match=message):
         read(path, max_bytes=largest - 1)
 

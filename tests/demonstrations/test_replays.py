@@ -248,7 +248,7 @@ def test_an_array_larger_than_may_be_read(path):
     with pytest.raises(FormatError, match=r"1742 bytes in all .* more than the 1741"):
         read(path, max_bytes=1741)
     with pytest.raises(
-        FormatError, match="image of 1280 bytes, more than the 1279 that"
+        FormatError, match="image of 1280 bytes, more than the 1279 allowed"
     ):
         read(path, max_bytes=1279)
 
@@ -308,7 +308,7 @@ HEADERS = {
     "huge": (npy(HEADER.format("<f4", "(999999999999999999, 2)")), "not as long"),
     "overflow": (
         npy(HEADER.format("<f4", "(4294967296, 4294967296)")),
-        "not as long as it says",
+        "claims a wrong length",
     ),
     "empty and huge": (
         npy(HEADER.format("<f4", "(0, 999999999999999999)")),
@@ -320,7 +320,7 @@ HEADERS = {
     ),
     "too long": (
         npy(HEADER.format("<f4", "(6, 2)"), bytes(49)),
-        "not as long as it says",
+        "claims a wrong length",
     ),
 }
 
@@ -350,8 +350,8 @@ def bomb(path, *, unpacked, declared):
     ("unpacked", "declared", "message"),
     [
         (100_000_000, 200, "cut off, damaged"),
-        (100_000_000, MAX_BYTES - 2000, "not as long as it says"),
-        (800, MAX_BYTES, "not as long as it says"),
+        (100_000_000, MAX_BYTES - 2000, "claims a wrong length"),
+        (800, MAX_BYTES, "claims a wrong length"),
     ],
 )
 def test_sizes_that_are_not_true(path, unpacked, declared, message):
@@ -373,7 +373,7 @@ def test_sizes_beyond_the_end_of_the_file(path):
     path.write_bytes(content)
     tracemalloc.start()
     try:
-        with pytest.raises(FormatError, match="not as long as it says"):
+        with pytest.raises(FormatError, match="claims a wrong length"):
             read(path, max_bytes=10**9)
         assert tracemalloc.get_traced_memory()[1] < MAX_BYTES
     finally:
@@ -385,7 +385,7 @@ def test_compressions_that_cannot_be_stopped_half_way(path, compression):
     action = io.BytesIO()
     np.save(action, ENTRIES["action"], allow_pickle=False)
     with_member(path, action.getvalue(), compression)
-    with pytest.raises(FormatError, match="packed by a compression that is not read"):
+    with pytest.raises(FormatError, match="unsupported compression"):
         read(path)
 
 
