@@ -1,4 +1,4 @@
-"""Episodes in one or several environments, which step while the learner learns."""
+"""Plays episodes in one or several environments."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -11,29 +11,26 @@ from jaxil.maths.types import Episode
 
 
 class InProcess:
-    """One environment of this process, as `Environments`: it steps when waited for."""
+    """Lets one `Environment` of this process serve as `Environments`."""
 
     size = 1
 
     def __init__(self, environment: Any) -> None:
-        """Takes a `PixelEnvironment`, or anything with its methods."""
+        """Neither owns nor closes the environment."""
         self._environment = environment
-        self._order: Callable[[], Any] = lambda: None
+        self._request: Callable[[], Any] = lambda: None
 
     def reset(self, index: int, episode: int) -> None:
         """See `Environments`."""
-        del index
-        self._order = lambda: self._environment.reset(episode=episode)
+        self._request = lambda: self._environment.reset(episode=episode)
 
     def step(self, index: int, action: np.ndarray) -> None:
         """See `Environments`."""
-        del index
-        self._order = lambda: self._environment.step(action)
+        self._request = lambda: self._environment.step(action)
 
     def receive(self, index: int) -> Moment:
         """See `Environments`."""
-        del index
-        timestep = self._order()
+        timestep = self._request()
         return Moment(
             observation=timestep.observation,
             frame=self._environment.single_observation(),
@@ -43,12 +40,12 @@ class InProcess:
         )
 
     def close(self) -> None:
-        """Does nothing: the environment is its maker's."""
+        """See `Environments`."""
 
 
 @dataclasses.dataclass
-class _Open:
-    """An episode that is being played, so far."""
+class _OpenEpisode:
+    """An unfinished episode."""
 
     number: int
     observation: np.ndarray | None = None
@@ -60,7 +57,7 @@ class _Open:
 
     def add(self, moment: Moment) -> None:
         self.observation, self.is_last = moment.observation, moment.is_last
-        if self.frames:  # the first moment is that of a reset
+        if self.frames:  # not at the reset
             self.rewards.append(moment.task_reward)
             self.discounts.append(moment.discount)
         self.frames.append(moment.frame)
@@ -75,10 +72,10 @@ class _Open:
 
 
 class Player:
-    """Plays episodes: `begin`, `step`, then `observe`, again and again.
+    """Plays episodes by repeated calls of `begin`, `step` and `observe`.
 
-    Episode i starts from the state that `reset(episode=i)` gives, whichever
-    environment plays it. A lost environment's episode is played again from its start.
+    Episode i starts with `reset(episode=i)`, in whichever environment is free. If an
+    environment is lost, its episode is restarted.
     """
 
     def __init__(
@@ -88,24 +85,23 @@ class Player:
         first_episode: int,
         open_episodes: Mapping[int, np.ndarray] | None = None,
     ) -> None:
-        """Starts nothing yet.
+        """Starts no episode yet.
 
         Args:
           environments: at least one.
           first_episode: number of the first episode that has not begun.
-          open_episodes: actions [t, A] of episodes, by number, that an earlier
-            process had begun: they are repeated, and the episodes go on from there.
+          open_episodes: actions [t, A] by episode number, of episodes to resume: their
+            actions are replayed first.
         """
         self._environments = environments
         self._next_episode = first_episode
-        self._waiting = dict(open_episodes or {})  # to be begun first
-        self._open: dict[int, _Open] = {}  # by environment
+        self._waiting = dict(open_episodes or {})
+        self._open: dict[int, _OpenEpisode] = {}  # by environment
 
     def begin(self, wanted: Callable[[int], bool]) -> bool:
         """Starts an episode in each free environment; returns whether any began.
 
-        Args:
-          wanted: asked for each new episode, by its number, whether to play it.
+        `wanted` decides by number whether to play a new episode.
         """
         begun = []
         for index in range(self._environments.size):
@@ -117,7 +113,7 @@ class Player:
             if number == self._next_episode:
                 self._next_episode += 1
             self._environments.reset(index, number)
-            self._open[index] = _Open(number)
+            self._open[index] = _OpenEpisode(number)
             begun.append((index, self._waiting.pop(number, ())))
         for index, actions in begun:
             self._receive(index)
@@ -129,7 +125,7 @@ class Player:
 
     @property
     def observations(self) -> np.ndarray:
-        """What the open episodes show, in the order of their numbers: [E, ...]."""
+        """The open episodes' observations [E, ...], by episode number."""
         shown = [self._open[index].observation for index in self._order()]
         return np.stack([each for each in shown if each is not None])
 
@@ -140,26 +136,22 @@ class Player:
 
     @property
     def open_episodes(self) -> dict[int, np.ndarray]:
-        """The actions [t, A] of each open episode by its number."""
+        """The actions [t, A] of each unfinished episode, by number."""
         found = {e.number: np.array(e.actions) for e in self._open.values()}
         return {**{n: np.array(a) for n, a in self._waiting.items()}, **found}
 
     def steps_left(self, episode_steps: int) -> int:
-        """Returns the agent steps that open episodes of a length still need."""
+        """Returns the agent steps until all open episodes have `episode_steps`."""
         played = [len(episode.actions) for episode in self._open.values()]
         return sum(max(episode_steps - steps, 0) for steps in played)
 
     def step(self, actions: np.ndarray) -> None:
-        """Sends actions [E, A], in the order of `observations`; does not wait."""
+        """Sends actions [E, A] in the order of `observations`, without waiting."""
         for index, action in zip(self._order(), actions, strict=True):
             self._step(index, action)
 
     def observe(self) -> list[Episode]:
-        """Waits for what comes of the actions.
-
-        Returns:
-          The episodes that ended, in the order of their numbers.
-        """
+        """Waits for the results; returns the finished episodes, by number."""
         finished = []
         for index in self._order():
             self._receive(index)
@@ -181,7 +173,7 @@ class Player:
 
     def _receive(self, index: int) -> None:
         moment = self._environments.receive(index)
-        if moment is None:  # lost, and the episode with it
+        if moment is None:  # the environment was lost
             self._waiting[self._open.pop(index).number] = np.zeros((0, 0))
         else:
             self._open[index].add(moment)

@@ -1,4 +1,4 @@
-"""Reads NumPy archives (.npz) that may be damaged or hostile; writes them atomically."""
+"""Reads NumPy archives (.npz), even damaged or hostile ones; writes them atomically."""
 
 import errno
 import io

@@ -16,7 +16,7 @@ import dm_env
 import numpy as np
 import pytest
 
-from jaxil.environments.interaction import interact, interact_together, join
+from jaxil.environments.player import InProcess, Player
 from jaxil.environments.pool import EnvironmentsFailed, Pool
 from jaxil.environments.suite import make_environment
 
@@ -58,32 +58,23 @@ def without_jax(make):
     return environment
 
 
-def play(pool, num_episodes, act=lambda seen: seen[:, :1] % 10, each_round=None):
-    """Plays whole episodes; returns them by number."""
-    under_way, whole, begun = {}, {}, set()
+def play(environments, num_episodes, act=lambda seen: seen[:, :1] % 10, after=None):
+    """Plays whole episodes; returns them by number.
 
-    def begin(episode):
-        begun.add(episode)
-        return episode < num_episodes
-
-    for number, decisions in enumerate(
-        interact_together(pool, act, first_episode=0, begin=begin)
-    ):
-        assert number < 100, "it goes on and on"
-        episodes = [decision.episode for decision in decisions]
-        assert episodes == sorted(episodes)
-        if each_round is not None:
-            each_round(number, decisions)
-        for decision in decisions:
-            if decision.first_frame is not None:
-                under_way[decision.episode] = []
-            under_way[decision.episode].append(decision)
-            if decision.is_last:
-                assert decision.episode not in whole
-                whole[decision.episode] = join(under_way.pop(decision.episode))
+    `after(round, seen)` is called after each round with what was seen before it.
+    """
+    player, whole = Player(environments, first_episode=0), []
+    for number in range(100):
+        player.begin(lambda episode: episode < num_episodes)
+        if player.is_playing:
+            seen = player.observations
+            player.step(act(seen))
+            whole += player.observe()
+            if after is not None:
+                after(number, seen)
         if len(whole) == num_episodes:
-            return whole
-    raise AssertionError
+            return sorted(whole, key=lambda episode: episode.frames.flat[0])
+    raise AssertionError("some episode never ended")
 
 
 def counting_pool(size, say=print, **seconds):
@@ -91,11 +82,11 @@ def counting_pool(size, say=print, **seconds):
 
 
 def assert_counted(episodes):
-    for number, episode in episodes.items():
+    for number, episode in enumerate(episodes):
         times = np.arange(STEPS + 1)
         np.testing.assert_array_equal(episode.frames[:, 0], 10 * number + times)
         np.testing.assert_array_equal(episode.actions[:, 0], times[:-1])
-        np.testing.assert_array_equal(episode.task_rewards, times[:-1])
+        np.testing.assert_array_equal(episode.rewards, times[:-1])
         np.testing.assert_array_equal(episode.discounts, 0.5)
 
 
@@ -127,23 +118,16 @@ def test_episodes_are_those_of_a_single_environment():
     def act(seen):  # anything that depends on all that is seen
         return np.cos(np.float64(seen).reshape(len(seen), -1).sum(axis=1))[:, None]
 
-    single = make()
     pool = Pool(functools.partial(without_jax, make), 2, say=print)
     with contextlib.closing(pool):
         found = play(pool, 3, act)
-    expected: list = [[]]
-    for decision in interact(single, lambda seen: act(seen[None])[0], first_episode=0):
-        expected[-1].append(decision)
-        if decision.is_last and len(expected) == 3:
-            break
-        if decision.is_last:
-            expected.append([])
+    single = make()
+    expected = play(InProcess(single), 3, act)
     single.close()
-    assert sorted(found) == [0, 1, 2]
-    for number, decisions in enumerate(expected):
-        for ours, theirs in zip(found[number], join(decisions), strict=True):
-            np.testing.assert_array_equal(ours, theirs)
-            assert ours.dtype == theirs.dtype
+    for ours, theirs in zip(found, expected, strict=True):
+        for one, other in zip(ours, theirs, strict=True):
+            np.testing.assert_array_equal(one, other)
+            assert one.dtype == other.dtype
     assert np.ptp(found[0].frames) > 0
     assert found[0].frames.shape[0] == 6
 
@@ -174,20 +158,20 @@ def test_a_lost_process_is_replaced_and_its_episode_played_again(number, said):
     pool = counting_pool(2, lines.append, step_seconds=3.0)
     first_pids = pool.pids
 
-    def lose_one(count, decisions):
-        rounds.append([decision.episode for decision in decisions])
+    def lose_one(count, seen):
+        rounds.append(seen[:, 0].tolist())
         if count == 1:
             os.kill(first_pids[0], number)
 
     with contextlib.closing(pool):
-        assert_counted(play(pool, 4, each_round=lose_one))
+        assert_counted(play(pool, 4, after=lose_one))
         assert pool.pids[1] == first_pids[1]
         assert pool.pids[0] != first_pids[0]
         assert not is_there(first_pids[0])
-    assert rounds[:4] == [[0, 1], [0, 1], [1], [0, 1]]
+    assert rounds[:4] == [[0, 10], [1, 11], [2, 12], [0, 13]]
     (line,) = lines
     assert f"environment 0 {'did ' * (number == signal.SIGSTOP)}{said}" in line
-    assert "plays episode 0 from its start" in line
+    assert "restarts episode 0" in line
 
 
 def test_an_error_of_the_environment_is_told_in_full():
