@@ -12,17 +12,11 @@ Act = Callable[[np.ndarray], np.ndarray]  # observation -> action [A]
 
 
 class Evaluation(NamedTuple):
-    """E episodes of one policy.
+    """E episodes of one policy."""
 
-    Attributes:
-      episodes: their rewards are the task's.
-      task_returns: undiscounted. Shape [E].
-      video: images of the first episode, uint8 [T + 1, H, W, 3], if requested.
-    """
-
-    episodes: list[Episode]
-    task_returns: np.ndarray
-    video: np.ndarray | None
+    episodes: list[Episode]  # with the task's rewards
+    task_returns: np.ndarray  # undiscounted. Shape [E]
+    video: np.ndarray | None  # of the first episode, uint8 [T + 1, H, W, 3]
 
     @property
     def mean(self) -> float:

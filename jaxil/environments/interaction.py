@@ -14,44 +14,30 @@ class Environment(Protocol):
     @property
     def episode_steps(self) -> int | None:
         """Agent steps of a whole episode; None without a time limit."""
-        ...
 
     def observation_spec(self) -> specs.Array:
         """Returns the spec of observations: uint8 [H, W, C] or float32 [S]."""
-        ...
 
     def action_spec(self) -> specs.BoundedArray:
         """Returns the spec of actions: float32 [A] in [-1, 1]."""
-        ...
 
     def reset(self, episode: int) -> dm_env.TimeStep:
         """Starts an episode, whose number determines the initial state."""
-        ...
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
         """Applies an action; the discount stays 1 at a time limit."""
-        ...
 
     def single_observation(self) -> np.ndarray:
         """Returns the current frame, not stacked: uint8 [H, W, 3] or float32 [S]."""
-        ...
 
 
 class Moment(NamedTuple):
-    """The result of a reset or a step.
+    """The result of a reset or a step."""
 
-    Attributes:
-      observation: the policy's input. uint8 [H, W, C] or float32 [S].
-      frame: the newest frame, which the replay stores. uint8 [H, W, 3] or float32 [S].
-      task_reward: sum over the action repeat; 0 at a reset.
-      discount: product over the action repeat; 1 at a reset and at a time limit.
-      is_last: whether the episode is over.
-    """
-
-    observation: np.ndarray
-    frame: np.ndarray
-    task_reward: float
-    discount: float
+    observation: np.ndarray  # the policy's input: uint8 [H, W, C] or float32 [S]
+    frame: np.ndarray  # the newest, for the replay: uint8 [H, W, 3] or float32 [S]
+    task_reward: float  # sum over the action repeat; 0 at a reset
+    discount: float  # product over the action repeat; 1 at a reset or time limit
     is_last: bool
 
 
@@ -62,16 +48,12 @@ class Environments(Protocol):
 
     def reset(self, index: int, episode: int) -> None:
         """Starts an episode in one simulator."""
-        ...
 
     def step(self, index: int, action: np.ndarray) -> None:
         """Sends it an action, shape [A]."""
-        ...
 
     def receive(self, index: int) -> Moment | None:
         """Waits for the result; None if the simulator and its episode are lost."""
-        ...
 
     def close(self) -> None:
         """Ends their processes."""
-        ...

@@ -21,15 +21,12 @@ class InProcess:
         self._request: Callable[[], Any] = lambda: None
 
     def reset(self, index: int, episode: int) -> None:
-        """See `Environments`."""
         self._request = lambda: self._environment.reset(episode=episode)
 
     def step(self, index: int, action: np.ndarray) -> None:
-        """See `Environments`."""
         self._request = lambda: self._environment.step(action)
 
     def receive(self, index: int) -> Moment:
-        """See `Environments`."""
         timestep = self._request()
         return Moment(
             observation=timestep.observation,

@@ -15,7 +15,7 @@ def require_regular(path: str | os.PathLike, *, or_folder: bool = False) -> None
     mode = pathlib.Path(path).stat().st_mode
     if not stat.S_ISREG(mode) and not (or_folder and stat.S_ISDIR(mode)):
         kind = "folder" if stat.S_ISDIR(mode) else "pipe, device or socket"
-        raise ValueError(f"is a {kind}, where a regular file is expected")
+        raise ValueError(f"is a {kind}, not a regular file")
 
 
 def printable(text: object, max_letters: int = 1000) -> str:

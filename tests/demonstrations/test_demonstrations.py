@@ -140,7 +140,7 @@ def test_samples_are_stacks_of_one_episode_with_their_actions(batch_size, frame_
     loaded = loading.Demonstrations(
         frames.astype(np.uint8), np.array([6, 6]), actions, actions[..., 0], {}
     )
-    observation, action = loading.sample(
+    observation, action, _ = loading.sample(
         loaded, np.random.default_rng(batch_size), batch_size, frame_stack=frame_stack
     )
     assert observation.shape == (batch_size, 2, 2, 3 * frame_stack)
@@ -198,7 +198,7 @@ def test_damaged_cache_entries_are_rendered_again(path, tmp_path, damage):
             np.save(file, np.zeros(3))
     np.testing.assert_array_equal(load(path).frames, FRAMES)
     assert drawn_images(path) == 0
-    assert not list(entry.parent.glob("*.part"))
+    assert not list(entry.parent.glob(".tmp-*"))
 
 
 def test_a_cache_that_cannot_be_written_is_done_without(path, monkeypatch, caplog):
@@ -228,10 +228,10 @@ def test_other_versions_are_said(path, caplog):
             {"task": "walker_walk"},
             "shows finger_turn_hard, but the task is walker_walk",
         ),
-        ({"num_episodes": 3}, "holds 2 episodes, and num_episodes=3"),
-        ({"num_episodes": 0}, "num_episodes=0 .* Ask for 1 to 2"),
-        ({"action_repeat": 3}, "action_repeat=2, which cannot serve action_repeat=3"),
-        ({"action_repeat": 1}, "Take a multiple of 2"),
+        ({"num_episodes": 3}, "holds 2 episodes, but num_episodes=3"),
+        ({"num_episodes": 0}, "num_episodes=0. Use 1 to 2"),
+        ({"action_repeat": 3}, "action_repeat=2, not 3"),
+        ({"action_repeat": 1}, "Use a multiple of 2"),
         ({"action_repeat": 10}, "shorter than one step of action_repeat=10"),
     ],
 )
@@ -266,11 +266,11 @@ TAMPERINGS = {
     "nan": (set_nan, "NaN or infinity in qvel, episode 1"),
     "wrong type": (
         lambda a: a.update(qpos=a["qpos"].astype(np.float32)),
-        "qpos of type float32, where float64",
+        "qpos of type float32, but float64",
     ),
     "a state too few": (
         lambda a: a.update(qpos=a["qpos"][:, :-1]),
-        r"qpos of shape \(2, 4, 3\), which does not fit rewards of shape \(2, 4\)",
+        r"qpos of shape \(2, 4, 3\) for rewards of \(2, 4\)",
     ),
     "an episode too few": (lambda a: a.update(actions=a["actions"][:1]), "actions of"),
     "no episodes": (
@@ -279,11 +279,11 @@ TAMPERINGS = {
     ),
     "another model": (
         lambda a: a.update(qpos=a["qpos"][..., :-1]),
-        "qpos of 2 numbers, where finger_turn_hard needs 3",
+        "qpos of 2 numbers, but finger_turn_hard needs 3",
     ),
     "actions of another model": (
         lambda a: a.update(actions=a["actions"][..., :-1]),
-        "actions of 1 numbers, where finger_turn_hard needs 2",
+        "actions of 1 numbers, but finger_turn_hard needs 2",
     ),
     "pickled": (
         lambda a: a.update(actions=np.array([{"a": 1}], dtype=object)),
@@ -297,11 +297,11 @@ TAMPERINGS = {
         lambda a: set_metadata(a, version=2),
         "version 2 of the format",
     ),
-    "no task": (lambda a: set_metadata(a, task=None), "task=None, where str"),
-    "boolean": (lambda a: set_metadata(a, seed=True), "seed=True, where int"),
+    "no task": (lambda a: set_metadata(a, task=None), "task=None, but str"),
+    "boolean": (lambda a: set_metadata(a, seed=True), "seed=True, but int"),
     "negative": (lambda a: set_metadata(a, first_episode=-1), "first_episode=-1"),
-    "few returns": (lambda a: set_metadata(a, returns=[1.0]), "2 numbers belong"),
-    "no return": (lambda a: set_metadata(a, returns=[1.0, None]), "2 numbers belong"),
+    "few returns": (lambda a: set_metadata(a, returns=[1.0]), "but 2 are expected"),
+    "no return": (lambda a: set_metadata(a, returns=[1.0, None]), "but 2 are expected"),
 }
 
 
@@ -357,7 +357,7 @@ def test_a_pipe_or_a_device_is_refused_at_once(use, tmp_path):
     pipe = tmp_path / "pipe.npz"
     os.mkfifo(pipe)
     for path in (pipe, pathlib.Path("/dev/zero")):
-        with pytest.raises(DemonstrationError, match="neither a file nor a folder"):
+        with pytest.raises(DemonstrationError, match="is a pipe, device or socket"):
             use(path, **{"task": TASK, "num_episodes": 1, "action_repeat": 2})
         with pytest.raises(DemonstrationError, match="not a regular file"):
             states.read_states(path)
