@@ -64,7 +64,6 @@ def open_recording(
 
     Raises:
       FormatError: unknown format, or the file breaks its format's rules.
-      OSError: the file cannot be opened.
     """
     try:
         require_regular(path, or_folder=True)
@@ -106,7 +105,6 @@ def read_episodes(
 
     Raises:
       FormatError: see `open_recording`; or too few episodes, or too many bytes.
-      OSError: the file cannot be opened.
     """
     recording = open_recording(
         path, max_bytes=max_bytes, frame_skip=frame_skip, image_size=image_size

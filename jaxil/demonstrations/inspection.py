@@ -53,7 +53,6 @@ def inspect(path: pathlib.Path, *, max_bytes: int, **view: Any) -> Inspection:
       DemonstrationError: a file of states is damaged.
       ValueError: the states do not fit their task.
       FormatError: another file is damaged or has an unknown format.
-      OSError: the file cannot be opened.
     """
     if states.recognises(path):
         return _inspect_states(path, view)
@@ -118,13 +117,7 @@ def _inspect_states(path: pathlib.Path, view: dict[str, Any]) -> Inspection:
 def render_recording(path: pathlib.Path, **view: Any) -> Recording:
     """Opens a file of states as a recording that is rendered while it is read.
 
-    Args:
-      path: the file.
-      view: `image_size` and `render_quality`.
-
-    Raises:
-      DemonstrationError: the file is damaged.
-      ValueError: the states do not fit their task.
+    `view` is `image_size` and `render_quality`. Raises the errors of `inspect`.
     """
     stored = states.read_states(path)
 

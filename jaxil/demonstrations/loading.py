@@ -97,7 +97,7 @@ def load(
 ) -> Demonstrations:
     """Loads demonstrations; states are rendered by the agent's own environment.
 
-    Args not listed here are those of `suite.make_environment`.
+    Arguments not listed are those of `suite.make_environment`.
 
     Args:
       source: a file or folder of any format in `foreign.FORMATS`; "" for the task's

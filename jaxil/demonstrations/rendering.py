@@ -51,7 +51,7 @@ def observe_episodes(
 ) -> np.ndarray:
     """Observes stored episodes with the agent's own environment.
 
-    Args not listed here are those of `suite.make_environment`.
+    Arguments not listed are those of `suite.make_environment`.
 
     Args:
       states: `qpos`, `qvel` and `act`, each of shape [K, N + 1, n].

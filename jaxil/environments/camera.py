@@ -37,7 +37,7 @@ class Renderer:
 
         Args:
           physics: a dm_control `Physics` that has not been rendered yet.
-          open_camera: called at the first image.
+          open_camera: see `OpenCamera`.
           image_size: height and width in pixels.
           camera: index of a camera of the model.
           render_quality: "paper" for dm_control's defaults; "fast" without

@@ -50,10 +50,7 @@ def evaluate(
       num_episodes: at least 1.
       first_episode: number of the first episode; it determines the initial states.
       record_video: whether to keep the first episode's images.
-      stop_asked: called before each agent step.
-
-    Raises:
-      Stopped: `stop_asked` returned True.
+      stop_asked: called before each agent step; True raises `Stopped`.
     """
     player = Player(InProcess(environment), first_episode=first_episode)
     episodes: list[Episode] = []

@@ -10,7 +10,6 @@ from dm_env import specs
 from jaxil.environments.camera import Renderer
 from jaxil.replay.stacking import gather_stacks
 
-_SEED_WORDS = 8
 _UNBOUNDED = 1e9  # MuJoCo's value for an actuator without limits
 
 
@@ -83,10 +82,8 @@ class PixelEnvironment(dm_env.Environment):
             episode = self._next_episode
         if episode < 0:
             raise ValueError(f"episode={episode} must not be negative.")
-        words = np.random.SeedSequence([self._seed, episode]).generate_state(
-            _SEED_WORDS
-        )
-        self._suite_environment.task.random.seed(words)
+        seeds = np.random.SeedSequence([self._seed, episode])
+        self._suite_environment.task.random.seed(seeds.generate_state(8))
         self._suite_environment.reset()
         self._next_episode = episode + 1
         self._reset_next_step = False
@@ -102,10 +99,9 @@ class PixelEnvironment(dm_env.Environment):
         if self._reset_next_step:
             return self.reset()
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != self._action_spec.shape:
-            raise ValueError(
-                f"action has shape {action.shape}, expected {self._action_spec.shape}."
-            )
+        expected = self._action_spec.shape
+        if action.shape != expected:
+            raise ValueError(f"action has shape {action.shape}, expected {expected}.")
         control = self._action_low + (action + 1.0) * self._action_half_range
         reward, discount, is_last = 0.0, 1.0, False
         for _ in range(self._action_repeat):
@@ -165,12 +161,10 @@ class PixelEnvironment(dm_env.Environment):
         data = self.physics.data
         values = {"qpos": qpos, "qvel": qvel, "act": act}
         for name, value in values.items():
-            shape = getattr(data, name).shape
-            if np.shape(value) != shape:
-                raise ValueError(
-                    f"{name} has shape {np.shape(value)}, but {self._name} "
-                    f"needs {shape}."
-                )
+            given, shape = np.shape(value), getattr(data, name).shape
+            if given != shape:
+                what = f"{name} has shape {given}"
+                raise ValueError(f"{what}, but {self._name} needs {shape}.")
         with self.physics.reset_context():
             for name, value in values.items():
                 getattr(data, name)[:] = value

@@ -101,9 +101,7 @@ class Pool:
     def receive(self, index: int) -> Moment | None:
         """Waits for the result; None if the process was lost.
 
-        Raises:
-          EnvironmentsFailed: the environment raised an error, or its process was lost
-            too often in a row.
+        Raises EnvironmentsFailed for an error of the environment or repeated losses.
         """
         worker = self._workers[index]
         seconds = self._step_seconds if worker.has_answered else self._start_seconds
@@ -113,9 +111,7 @@ class Pool:
                 self._losses[index] = 0
             return answer
         if worker.has_raised:
-            raise EnvironmentsFailed(
-                f"environment {index} raised an error:\n{answer.rstrip()}"
-            )
+            raise EnvironmentsFailed(f"environment {index} raised an error:\n{answer}")
         self._workers.pop(index).close()
         self._reasons[index] = answer
         self._losses[index] += 1
@@ -192,5 +188,5 @@ def _serve(make: Callable[[], Any], pipe: Any) -> None:
         except (EOFError, ConnectionError):
             raise  # the parent is gone
         except Exception:
-            pipe.send(traceback.format_exc())
+            pipe.send(traceback.format_exc().rstrip())
     os._exit(0)  # without cleanup, in which GL drivers may hang

@@ -84,9 +84,6 @@ def make_environment(
       frame_stack: images per observation; ignored for states.
       render_quality: "paper", "fast" or "smooth".
       observation: "pixels" or "state".
-
-    Raises:
-      ValueError: an argument is out of range.
     """
     for name, value, least in (
         ("seed", seed, 0),
@@ -101,9 +98,8 @@ def make_environment(
         ("render_quality", render_quality, RENDER_QUALITIES),
     ):
         if value not in known:
-            raise ValueError(
-                f"{name}={value!r} is unknown; choose one of: {', '.join(known)}."
-            )
+            names = ", ".join(known)
+            raise ValueError(f"{name}={value!r} is unknown; choose one of: {names}.")
     from dm_control import suite
 
     domain, name = split_task(task)

@@ -56,10 +56,8 @@ def read_archive(
 
     Sizes are checked in the headers of archive and arrays before anything is unpacked.
 
-    Args:
-      path: the file.
-      max_bytes: largest unpacked size of each array to read, by name. The largest of
-        these limits also bounds their sum.
+    `max_bytes` is the largest unpacked size of each array to read. The largest of these
+    limits also bounds their sum.
 
     Raises:
       OSError: the file cannot be opened, or is not a regular file.

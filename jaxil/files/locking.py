@@ -24,10 +24,7 @@ def locked(path: pathlib.Path) -> Iterator[None]:
 
     Without file-system locks, PATH.owner replaces the lock: a file, created
     exclusively, of host, process id and time. It is taken over if its process has ended
-    on this host.
-
-    Raises:
-      InUseError: another process holds the lock.
+    on this host. Raises InUseError if another process holds the lock.
     """
     with path.open("a") as file:
         try:

@@ -10,7 +10,6 @@ def require_regular(path: str | os.PathLike, *, or_folder: bool = False) -> None
 
     Raises:
       ValueError: not a regular file; continues a sentence that begins with its name.
-      OSError: there is no such file.
     """
     mode = pathlib.Path(path).stat().st_mode
     if not stat.S_ISREG(mode) and not (or_folder and stat.S_ISDIR(mode)):

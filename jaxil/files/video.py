@@ -1,7 +1,6 @@
 """Writes videos of one episode, or of two side by side."""
 
 import os
-import pathlib
 from collections.abc import Iterator
 from fractions import Fraction
 
@@ -33,25 +32,21 @@ def write_video(
       frames_right: uint8 [T', H, W, 3] of the same size, or None.
       fps: frames per second of the video.
       labels: captions.
-
-    Raises:
-      ValueError: wrong shape or dtype.
-      OSError: the file cannot be written.
     """
+    import av
+    import av.error
+
     sides = [frames_left] if frames_right is None else [frames_left, frames_right]
     for name, frames in zip(("frames_left", "frames_right"), sides, strict=False):
         if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8:
-            raise ValueError(
-                f"{name} = {frames.dtype} {frames.shape}: expected uint8 [T, H, W, 3]"
-            )
+            found = f"{frames.dtype} {frames.shape}"
+            raise ValueError(f"{name} = {found}: expected uint8 [T, H, W, 3]")
         if not len(frames) or frames.shape[1:] != frames_left.shape[1:]:
-            raise ValueError(
-                f"{name}.shape = {frames.shape}: expected at least one frame,"
-                f" of {frames_left.shape[1:]}"
-            )
+            expected = f"at least one frame of {frames_left.shape[1:]}"
+            raise ValueError(f"{name}.shape = {frames.shape}: expected {expected}")
     canvas, corners, factor = _canvas(frames_left.shape[1:3], labels[: len(sides)])
 
-    def pictures() -> Iterator[np.ndarray]:
+    def images() -> Iterator[np.ndarray]:
         for step in range(max(map(len, sides))):
             for frames, (row, column) in zip(sides, corners, strict=True):
                 frame = frames[min(step, len(frames) - 1)]
@@ -59,37 +54,22 @@ def write_video(
                 canvas[row : row + big.shape[0], column : column + big.shape[1]] = big
             yield canvas
 
-    with writing.replacing(path) as temporary:
-        _encode(temporary, pictures(), size=canvas.shape[:2], fps=fps)
-
-
-def _encode(
-    path: pathlib.Path,
-    pictures: Iterator[np.ndarray],
-    *,
-    size: tuple[int, int],
-    fps: float,
-) -> None:
-    """Writes images [H, W, 3] as H.264, which every browser plays."""
-    import av
-    import av.error
-
-    rate = Fraction(fps).limit_denominator(60_000)
-    try:
-        with (
-            path.open("wb") as file,
-            av.open(file, "w", "mp4", options={"movflags": "+faststart"}) as container,
-        ):
-            stream = container.add_stream(
-                "libx264", rate, options={"preset": "veryfast", "crf": "18"}
-            )
-            stream.height, stream.width = size
-            stream.pix_fmt = "yuv420p"  # needs even sizes
-            for picture in pictures:
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture)))
-            container.mux(stream.encode())
-    except av.error.FFmpegError as error:
-        raise OSError(f"the video could not be encoded: {error}") from error
+    options = {"movflags": "+faststart"}  # browsers play it while it loads
+    with writing.replacing(path) as temporary, temporary.open("wb") as file:
+        try:
+            with av.open(file, "w", "mp4", options=options) as container:
+                stream = container.add_stream(
+                    "libx264",
+                    Fraction(fps).limit_denominator(60_000),
+                    options={"preset": "veryfast", "crf": "18"},
+                )
+                stream.height, stream.width = canvas.shape[:2]
+                stream.pix_fmt = "yuv420p"  # needs even sizes
+                for image in images():
+                    container.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
+                container.mux(stream.encode())
+        except av.error.FFmpegError as error:
+            raise OSError(f"the video could not be encoded: {error}") from error
 
 
 def _canvas(

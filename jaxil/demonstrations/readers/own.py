@@ -33,12 +33,9 @@ _OPTIONAL = {"task": str, "action_repeat": int, "frames_per_second": float}
 
 
 def write_pixels(path: str | os.PathLike, recording: Recording, *, origin: str) -> None:
-    """Writes a recording atomically, one episode at a time.
+    """Writes a recording atomically, consuming its episodes one at a time.
 
-    Args:
-      path: the file.
-      recording: its episodes are consumed.
-      origin: where the pixels come from, as text.
+    `origin` says where the pixels come from.
     """
     metadata = {
         "format": FORMAT,
