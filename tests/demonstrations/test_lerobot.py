@@ -150,7 +150,7 @@ def without(name):
 TIME = f"videos/{CAMERA}/from_timestamp"
 ROW_FAULTS = {
     "no column": (EPISODES_FILE, without("length"), "has no column length in file-000"),
-    "an episode too few": (EPISODES_FILE, lambda rows: rows[:2], "has 2 episodes in"),
+    "an episode too few": (EPISODES_FILE, lambda rows: rows[:2], "has 2 episodes, not"),
     "an episode twice": (
         EPISODES_FILE,
         set_row(1, episode_index=0),
@@ -210,7 +210,7 @@ ROW_FAULTS = {
     "an action of nothing": (
         DATA_FILE,
         set_row(1, action=[1.0, None]),
-        "without a num",
+        "not numbers in",
     ),
     "two rewards": (
         DATA_FILE,
@@ -234,7 +234,7 @@ def test_rows_that_break_the_rules_are_refused(path, name):
     ("picture", "message"),
     [
         ({"bytes": None, "path": "/etc/passwd"}, "does not store its images"),
-        ({"bytes": b"\x89PNG\r\n\x1a\n", "path": ""}, "has a damaged picture 0"),
+        ({"bytes": b"\x89PNG\r\n\x1a\n", "path": ""}, "has a damaged image 0"),
         ({"path": "a.png"}, "does not store its images"),
         ("a.png", "does not store its images"),
     ],

@@ -183,8 +183,8 @@ def test_the_one_image_of_a_dictionary_is_taken(tmp_path):
 @pytest.mark.parametrize(
     ("images", "message"),
     [
-        (("left", "right"), "has 2 images .* not one: .*/left of .*/right of"),
-        ((), r"has 0 images .* not one: .*speed of float32 \(4, 3\)"),
+        (("left", "right"), "has 2 images.* not one: .*/left of .*/right of"),
+        ((), r"has 0 images.* not one: .*speed of float32 \(4, 3\)"),
     ],
 )
 def test_dictionaries_without_one_image_are_refused(tmp_path, images, message):

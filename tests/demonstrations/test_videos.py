@@ -234,9 +234,7 @@ def test_a_gif_damaged_in_the_middle_is_refused_and_one_with_a_tail_is_not(tmp_p
 @pytest.mark.parametrize("num_frames", [1, 3])
 def test_two_frames_are_needed(path, num_frames):
     encode_video(path, make_frames(num_frames))
-    message = (
-        f"has {num_frames} frames, too few to keep two with frame_skip={num_frames}"
-    )
+    message = f"has {num_frames} frames, too few for frame_skip={num_frames}"
     with pytest.raises(FormatError, match=message):
         read(path, frame_skip=num_frames)
 

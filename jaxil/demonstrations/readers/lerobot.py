@@ -153,7 +153,7 @@ def _find_episodes(dataset: _Dataset) -> list[_Location]:
         episodes.append(_Location(index, length, data, video_file, start))
     episodes.sort()
     if [episode.index for episode in episodes] != list(range(dataset.num_episodes)):
-        raise FormatError(f"does not have the episodes 0 to {dataset.num_episodes - 1}")
+        raise FormatError(f"has {len(rows)} episodes, not 0 to {dataset.num_episodes - 1}")
     return episodes
 
 
