@@ -153,7 +153,8 @@ def _find_episodes(dataset: _Dataset) -> list[_Location]:
         episodes.append(_Location(index, length, data, video_file, start))
     episodes.sort()
     if [episode.index for episode in episodes] != list(range(dataset.num_episodes)):
-        raise FormatError(f"has {len(rows)} episodes, not 0 to {dataset.num_episodes - 1}")
+        wanted = f"0 to {dataset.num_episodes - 1}"
+        raise FormatError(f"has {len(rows)} episodes, not {wanted}")
     return episodes
 
 
