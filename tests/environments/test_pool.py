@@ -170,7 +170,7 @@ def test_a_lost_process_is_replaced_and_its_episode_played_again(sent, said):
     assert rounds[:4] == steps
     (line,) = lines
     assert f"environment 0 {'did ' * (sent == signal.SIGSTOP)}{said}" in line
-    assert "plays episode 0 from its start" in line
+    assert "restarts episode 0" in line
 
 
 def test_an_error_of_the_environment_is_told_in_full():
