@@ -1,4 +1,4 @@
-"""Convolution with ReLU; `encoding` has another form of it, for CPUs."""
+"""Convolution with ReLU, computed by XLA. For CPUs see also `native.encoding`."""
 
 import functools
 from typing import Any
@@ -18,7 +18,7 @@ def convolve_relu(images: Array, kernel: Array, bias: Array, stride: int) -> Arr
       images: shape [B, H, W, C].
       kernel: shape [h, w, C, F].
       bias: shape [F].
-      stride: s, along H and W.
+      stride: s.
 
     Returns:
       Shape [B, (H - h) // s + 1, (W - w) // s + 1, F].
@@ -49,8 +49,8 @@ def _backward(
     _, to_both = jax.vjp(functools.partial(_plain, stride), images, kernel)
     image_gradient, kernel_gradient = to_both(cotangent)
     if kernel.shape[:2] == (stride, stride):
-        # A penalty on pixels differentiates this once more: XLA's own form of that
-        # takes a fifth of DAC's update on a CPU.
+        # The gradient penalty on pixels differentiates this again. On a CPU XLA's own
+        # version of that takes a fifth of DAC's update.
         image_gradient = tile_gradient(cotangent, kernel, images.shape[1:3])
     return image_gradient, kernel_gradient
 
@@ -60,16 +60,14 @@ _XLA.defvjp(_forward, _backward)
 
 
 def tile_gradient(cotangent: Array, kernel: Array, size: tuple[int, ...]) -> Array:
-    """Returns what a cotangent of a convolution of tiles means for the images.
+    """Returns the image gradient of a convolution whose windows do not overlap.
 
         dx[h i + u, w j + v] = k[u, v] dy[i, j]
-
-    No two windows overlap, so nothing is summed but the features.
 
     Args:
       cotangent: shape [B, H // h, W // w, F].
       kernel: shape [h, w, C, F].
-      size: H and W; what no window reaches gets 0.
+      size: H and W; pixels outside all windows get 0.
 
     Returns:
       Shape [B, H, W, C].

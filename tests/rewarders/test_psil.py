@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from jaxil.maths import augmentation, transport
+from jaxil.maths import stacking, transport
 from jaxil.maths.types import ExpertEpisodes
 from jaxil.networks.agent import actor_features
 from jaxil.rewarders.matching import closest_rewards, make_matching
@@ -161,7 +161,7 @@ def test_rewards_step_by_step(frame_stack):
     frames = random_frames(1, STEPS + 1)
 
     def features(frames):
-        stacks = augmentation.stack_frames(frames, frame_stack=frame_stack)
+        stacks = stacking.stack_frames(frames, frame_stack=frame_stack)
         return actor_features(NETWORKS, params.encoder, params.actor, stacks)
 
     candidates = []
