@@ -1,4 +1,4 @@
-"""An encoder's convolutions in C: all layers of an image at once, for CPUs."""
+"""The encoder's convolutions in C, for CPUs: all layers, image by image."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -9,13 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-# By two vectors of a processor it takes features; no CPU's vectors are longer.
-FEATURES = 32
+FEATURES = 32  # two of the longest vectors that CPUs have
 MOST_LAYERS = 8
 
 
 class Weights(NamedTuple):
-    """Of one layer.
+    """The parameters of one layer.
 
     Attributes:
       kernel: float32 [h, w, C, F], F a multiple of FEATURES.
@@ -40,16 +39,16 @@ def encode(
         x_l[i, j, f] = max(0, z[i, j, f])
         z[i, j, f] = b[f] + sum_{u,v,c} x_{l-1}[s i + u, s j + v, c] k[u, v, c, f]
 
-    `native.build` must have loaded the library. It can be differentiated once, for the
-    weights; pixels and mean have no gradient. Kernels of 3x3 without stride use
-    `winograd.h`, which rounds differently and spreads non-finite values by a pixel.
+    `native.build` must have loaded the library. Only first derivatives with respect to
+    the weights are defined. Kernels of 3x3 with stride 1 use `winograd.h`, which rounds
+    differently and spreads non-finite values by a pixel.
 
     Args:
       pixels: uint8 [B, H, W, C].
-      mean: float32 [H, W, C], or of one number, any rank.
-      weights: of each layer, at most MOST_LAYERS.
+      mean: float32 [H, W, C], or one number of any rank.
+      weights: at most MOST_LAYERS.
       contrast: factor on the centred pixels.
-      strides: s of each layer, along both sides.
+      strides: s of each layer.
 
     Returns:
       The last layer's output, float32 [B, H', W', F].
@@ -75,7 +74,7 @@ class _Settings(NamedTuple):
 
 
 class _Saved(NamedTuple):
-    """What the gradients need; an output tells where ReLU let pass."""
+    """What the gradients need; outputs are positive where ReLU was active."""
 
     pixels: Array
     mean: Array
@@ -118,7 +117,7 @@ def _outputs(
     *,
     wanted: int,
 ) -> Sequence[Array]:
-    """Returns the outputs of the last layers, as many as are wanted."""
+    """Returns the outputs of the last `wanted` layers."""
     size, shapes = pixels.shape[1:3], []
     for (kernel, _), stride in zip(weights, settings.strides, strict=True):
         assert all(n >= k for n, k in zip(size, kernel.shape)), (size, kernel.shape)
@@ -137,7 +136,7 @@ def _call(
     settings: _Settings,
     *arguments: Any,
 ) -> Sequence[Array]:
-    """Calls a function of encoder.c with the leaves of the arguments in their order."""
+    """Calls a function of encoder.c with the leaves of the arguments."""
     call = jax.ffi.ffi_call(name, results, vmap_method="sequential")
     return call(
         *jax.tree.leaves(arguments),
