@@ -1,4 +1,4 @@
-"""How long a call takes: repeated, after a first call that may compile."""
+"""Times repeated calls, after a first call that may compile."""
 
 import time
 from collections.abc import Callable
@@ -9,15 +9,15 @@ import numpy as np
 
 
 class Timing(NamedTuple):
-    """Seconds of one call over all repeats."""
+    """Seconds per call."""
 
-    median: float  # what is reported: other processes only ever add time
+    median: float  # not the mean: other processes only add time
     low: float
     high: float
 
 
 def timed(function: Callable[[], Any], repeats: int) -> Timing:
-    """Times a function, and waits for its result: jax computes asynchronously."""
+    """Times a function until its result is ready, since jax is asynchronous."""
     jax.block_until_ready(function())
     seconds = []
     for _ in range(repeats):
