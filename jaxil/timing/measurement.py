@@ -5,17 +5,18 @@ import functools
 import pathlib
 import sys
 import tempfile
-from collections.abc import Mapping
-from typing import Any
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxil.config import Config
 from jaxil.machine import devices, memory
 from jaxil.timing import start
 from jaxil.timing.bench import Bench, num_bytes
-from jaxil.timing.clock import timed
 
 _TURNS = 4  # the loop's two forms alternate
 _SHORT_PARTS = ("physics_ms", "render_ms", "act_ms")  # get ten times the repeats
@@ -135,6 +136,25 @@ def _product_flops_per_second() -> float:
         if seconds > _LONG_SECONDS:
             break
     return best
+
+
+class Timing(NamedTuple):
+    """Seconds per call."""
+
+    median: float  # not the mean: other processes only add time
+    low: float
+    high: float
+
+
+def timed(function: Callable[[], Any], repeats: int) -> Timing:
+    """Times a function until its result is ready, after a call that may compile."""
+    jax.block_until_ready(function())
+    seconds = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        jax.block_until_ready(function())
+        seconds.append(time.perf_counter() - begin)
+    return Timing(float(np.median(seconds)), min(seconds), max(seconds))
 
 
 def _say(text: str) -> None:
