@@ -1,5 +1,6 @@
 """Learning steps that assemble stacks of frames from a device copy."""
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -30,18 +31,7 @@ class Frames(NamedTuple):
 
 def gather_batch(frames: Data, batch: Batch) -> Batch:
     """Replaces the frame indices of a batch from `Replay.sample_indices` by stacks."""
-    window = batch.window
-    if window is not None:
-        window = window._replace(observation=gather_stacks(frames, window.observation))
-    successor = batch.successor
-    if successor is not None:
-        successor = gather_stacks(frames, successor)
-    return batch._replace(
-        observation=gather_stacks(frames, batch.observation),
-        next_observation=gather_stacks(frames, batch.next_observation),
-        successor=successor,
-        window=window,
-    )
+    return batch.map_observations(functools.partial(gather_stacks, frames))
 
 
 def gather_expert(frames: Data, expert: ExpertBatch) -> ExpertBatch:

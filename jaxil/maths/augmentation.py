@@ -38,9 +38,5 @@ def random_shift(images: Array, key: Array, *, padding: int) -> Array:
     shifts = corners - padding
     rows = jnp.clip(jnp.arange(height)[None] + shifts[:, :1], 0, height - 1)
     columns = jnp.clip(jnp.arange(width)[None] + shifts[:, 1:], 0, width - 1)
-    indices = (
-        jnp.arange(batch)[:, None, None],
-        rows[:, :, None],
-        columns[:, None, :],
-    )
+    indices = jnp.arange(batch)[:, None, None], rows[:, :, None], columns[:, None, :]
     return jnp.asarray(images).at[indices].get(mode="promise_in_bounds")

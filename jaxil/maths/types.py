@@ -5,6 +5,7 @@ K demonstrations, H W C pixels (channels last, the stack folded into C),
 S state vector, R representation, D feature, A action, n steps of a window.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 Params = Any  # a pytree of arrays, from flax
@@ -52,6 +53,18 @@ class Batch(NamedTuple):
     next_observation: Data
     successor: Data | None = None
     window: Window | None = None
+
+    def map_observations(self, function: Callable[[Data], Data]) -> "Batch":
+        """Returns a batch with the function's results instead of all observations."""
+        successor, window = self.successor, self.window
+        if window is not None:
+            window = window._replace(observation=function(window.observation))
+        return self._replace(
+            observation=function(self.observation),
+            next_observation=function(self.next_observation),
+            successor=None if successor is None else function(successor),
+            window=window,
+        )
 
 
 class ExpertBatch(NamedTuple):

@@ -73,15 +73,6 @@ class _Settings(NamedTuple):
     strides: tuple[int, ...]
 
 
-class _Saved(NamedTuple):
-    """What the gradients need; outputs are positive where ReLU was active."""
-
-    pixels: Array
-    mean: Array
-    weights: tuple[Weights, ...]
-    outputs: Sequence[Array]
-
-
 def _encode(
     settings: _Settings, pixels: Array, mean: Array, weights: tuple[Weights, ...]
 ) -> Array:
@@ -91,15 +82,17 @@ def _encode(
 
 def _forward(
     settings: _Settings, pixels: Array, mean: Array, weights: tuple[Weights, ...]
-) -> tuple[Array, _Saved]:
+) -> tuple[Array, tuple]:
     outputs = _outputs(settings, pixels, mean, weights, wanted=len(weights))
-    return outputs[-1], _Saved(pixels, mean, weights, outputs)
+    # Outputs are positive where ReLU was active.
+    return outputs[-1], (pixels, mean, weights, outputs)
 
 
 def _backward(
-    settings: _Settings, saved: _Saved, cotangent: Array
+    settings: _Settings, saved: tuple, cotangent: Array
 ) -> tuple[None, None, tuple[Weights, ...]]:
-    shapes = [_array(*leaf.shape) for leaf in jax.tree.leaves(saved.weights)]
+    _, _, weights, _ = saved
+    shapes = [_array(*leaf.shape) for leaf in jax.tree.leaves(weights)]
     gradients = _call("jaxil_encode_gradient", shapes, settings, saved, cotangent)
     of_layers = zip(gradients[::2], gradients[1::2], strict=True)
     return None, None, tuple(Weights(*layer) for layer in of_layers)

@@ -43,13 +43,7 @@ def make_agent_networks(
         encoder = StateEncoder(hidden_dim)
     else:
         encoder = PixelEncoder(
-            channels,
-            kernel_sizes,
-            strides,
-            contrast,
-            mean,
-            dtype,
-            native,
+            channels, kernel_sizes, strides, contrast, mean, dtype, native
         )
     return AgentNetworks(
         encoder=encoder,

@@ -92,25 +92,7 @@ class Replay(EpisodeRing):
         batch = self.sample_indices(
             rng, batch_size, windows=windows, successors=successors
         )
-        # All stacks in one call, which distributes the work among threads.
-        parts = [batch.observation[None], batch.next_observation[None]]
-        if batch.successor is not None:
-            parts.append(batch.successor[None])
-        if batch.window is not None:
-            parts.append(batch.window.observation.swapaxes(0, 1))
-        slots = np.concatenate(parts)
-        stacks = gather_stacks(self._frames, slots.reshape(-1, self._frame_stack))
-        stacks = stacks.reshape(*slots.shape[:2], *stacks.shape[1:])
-        window = batch.window
-        if window is not None:
-            inside = stacks[-self._window :].swapaxes(0, 1)
-            window = window._replace(observation=np.ascontiguousarray(inside))
-        return batch._replace(
-            observation=stacks[0],
-            next_observation=stacks[1],
-            successor=None if batch.successor is None else stacks[2],
-            window=window,
-        )
+        return batch.map_observations(lambda each: gather_stacks(self._frames, each))
 
     def sample_indices(
         self,

@@ -19,14 +19,16 @@ def gather_stacks(frames: np.ndarray, indices: np.ndarray) -> np.ndarray:
 
     Args:
       frames: [N, H, W, C], or [N, S] if K is 1.
-      indices: [B, K], in [0, N): the frames of each stack, oldest first.
+      indices: [..., K], in [0, N): the frames of each stack, oldest first.
 
     Returns:
-      A new array [B, H, W, K * C], or [B, S], in C order.
+      A new array [..., H, W, K * C], or [..., S], in C order.
     """
-    batch_size, num_stacked = indices.shape
+    *axes, num_stacked = indices.shape
     if num_stacked == 1:
-        return frames[indices[:, 0]]
+        return frames[indices[..., 0]]
+    indices = indices.reshape(-1, num_stacked)
+    batch_size = len(indices)
     height, width, channels = frames.shape[1:]
     pixels = frames.reshape(len(frames), height * width, channels)
     stacks = np.empty(
@@ -50,4 +52,4 @@ def gather_stacks(frames: np.ndarray, indices: np.ndarray) -> np.ndarray:
     else:
         for block in blocks:
             fill(block)
-    return stacks.reshape(batch_size, height, width, num_stacked * channels)
+    return stacks.reshape(*axes, height, width, num_stacked * channels)
