@@ -46,7 +46,8 @@ class Bench:
     """A run that has stored one episode of random actions and updated once.
 
     Attributes:
-      config: of the run, which acts and learns from the first agent step.
+      run: acts and learns from the first agent step.
+      config: of the run.
       episode: the random one.
       batches: the agent's and the experts' batch of one update, on the host.
       first_update_seconds: includes compilation.
@@ -61,7 +62,7 @@ class Bench:
             config.exploration_steps = 0
             config.seed_frames = config.total_frames = config.action_repeat
         self._demonstrations = assembly.load_demonstrations(config)
-        self._run = run = _Loop(**make_parts(config, folder, self._demonstrations, say))
+        self.run = run = _Loop(**make_parts(config, folder, self._demonstrations, say))
         self._environment = assembly.training_environment(config)
         run.progress = ProgressLine(config.total_frames, stream=io.StringIO())
         self._rng = np.random.default_rng(0)
@@ -86,7 +87,7 @@ class Bench:
 
     def parts(self) -> dict[str, tuple[Callable[[], Any], int]]:
         """Returns the parts of a run by name, and how often one call executes each."""
-        run, config = self._run, self.config
+        run, config = self.run, self.config
         is_state = config.observation == "state"
         render = (
             self._environment.frame if is_state else self._environment.renderer.render
@@ -102,19 +103,19 @@ class Bench:
 
     def sample(self) -> Any:
         """Returns the batches of one update."""
-        return self._run.updates.sample(self._rng)
+        return self.run.updates.sample(self._rng)
 
     def update(self) -> Any:
         """Dispatches updates like a run; returns the new state."""
-        run, agent = self._run, self._run.agent
+        run, agent = self.run, self.run.agent
         step = agent.repeated_step if self._several > 1 else agent.update_step
         run.state, run.metrics = step(run.state, *self._on_device, run.updates.frames())
         return run.state
 
     def add_episode(self) -> None:
         """Stores the random episode."""
-        self._run.replay.add_episode(**self.episode._asdict())
-        self._run.updates.episode_added()
+        self.run.replay.add_episode(**self.episode._asdict())
+        self.run.updates.episode_added()
 
     def fill_replay(self) -> None:
         """Stores episodes until the replay is full, then updates."""
@@ -131,7 +132,7 @@ class Bench:
           Environment frames, seconds, and the seconds of environments, acting and
           updates alone.
         """
-        run, first_frame = self._run, self._run.frame
+        run, first_frame = self.run, self.run.frame
         run.waits, before = waits, sum(run.stopwatch.seconds.values())
         with self.config.unlocked():
             self.config.total_frames = first_frame + steps * self.config.action_repeat
@@ -145,7 +146,7 @@ class Bench:
 
     def lower(self, *, convolutions: str | None = None) -> Any:
         """Traces and lowers one update, if given with other `convolutions`."""
-        run, agent = self._run, self._run.agent
+        run, agent = self.run, self.run.agent
         if convolutions is not None:
             config = self.config.copy_and_resolve_references()
             with config.unlocked():
@@ -157,18 +158,10 @@ class Bench:
         )
         return agent.update_step.lower(*shapes)
 
-    def replay_bytes(self) -> int:
-        """Returns the size of the frames of a full replay."""
-        return self._run.replay.frames.nbytes
-
-    def state_bytes(self) -> int:
-        """Returns the size of the learner's state."""
-        return num_bytes(self._run.state)
-
     def close(self) -> None:
         """Ends worker processes and closes files."""
-        self._run.close()
-        self._run.log.close()
+        self.run.close()
+        self.run.log.close()
 
     def _physics_step(self) -> Callable[[], Any]:
         """Returns a function that steps an environment without rendering."""

@@ -103,10 +103,10 @@ def _memory(bench: Bench) -> dict[str, float | None]:
     program = bench.lower().compile().memory_analysis()
     on_device = devices.peak_bytes()
     return {
-        "learner_state_mb": bench.state_bytes() / 1e6,
+        "learner_state_mb": num_bytes(bench.run.state) / 1e6,
         "batch_mb": num_bytes(bench.batches) / 1e6,
         "update_temp_mb": getattr(program, "temp_size_in_bytes", 0) / 1e6,
-        "replay_gb": bench.replay_bytes() / 1e9,
+        "replay_gb": bench.run.replay.frames.nbytes / 1e9,
         "peak_memory_gb": memory.peak_bytes() / 1e9,
         "peak_device_memory_gb": None if on_device is None else on_device / 1e9,
     }
