@@ -11,9 +11,9 @@ shadows. Other deviations from the paper:
 - The squared pre-tanh mean is penalised, since small actors saturate permanently.
 - Exploration ends sooner, the agent updates every step and learning rates are higher,
   since runs have to be short.
-- The replay is smaller, so that its rewards are newer, and `reward_refresh_steps = 2_500`
-  recomputes them: those of the first episodes come from an untrained discriminator and
-  would teach the critic that random behaviour is best.
+- The replay is smaller, so that its rewards are newer, and they are recomputed
+  (`reward_refresh_steps = 2_500`): those of the first episodes come from an untrained
+  discriminator and would teach the critic that random behaviour is best.
 - cartpole_swingup repeats actions 4 times: with 2, a pole at 1 rad/s moves a quarter of
   a pixel between frames, which hides its speed, and agents only learned to spin it;
   with 8, none learned to balance it. P-DAC's gradient penalty has weight 1 there.
