@@ -48,13 +48,9 @@ def results(
 ) -> Generator[Any, None, None]:
     """Yields what a generator function yields in a child process.
 
-    Args:
-      function: a generator function at the top level of an importable module.
-      *arguments: picklable.
-      seconds: longest wait for a result.
-      cpu_seconds: longest computation of a result.
-      memory_bytes: of all data in the process.
-      result_bytes: of all arrays in a result.
+    The function is at the top level of a module and its arguments are picklable. Limits
+    on wall clock and processor time are per result; `memory_bytes` limits all data of
+    the process, `result_bytes` all arrays of a result.
 
     Raises:
       ChildError: the function raised an error or took too long, or the process died.

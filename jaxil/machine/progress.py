@@ -74,9 +74,8 @@ class ProgressLine:
 
         Args:
           frame: environment frames so far.
-          seconds: of this process so far, by activity; the remaining time is shown as
-            "rest".
-          returns: last returns by name, e.g. task, imitation, evaluation.
+          seconds: spent so far by activity; what is missing is shown as "rest".
+          returns: last returns by name.
         """
         now = self._clock()
         if now < self._next_update:
@@ -84,7 +83,10 @@ class ProgressLine:
         self._next_update = now + _TTY_SECONDS
         self._progress.update(self._task, completed=frame)
         if self._live:
-            self._start()
+            if not self._progress.live.is_started:
+                self._progress.start()
+                # A killed run would leave it hidden.
+                self._progress.console.show_cursor(True)
             line = self._line(now, seconds, returns or {})
             self._progress.update(self._task, description=line, refresh=True)
         elif now >= self._next_line:
@@ -101,12 +103,6 @@ class ProgressLine:
     def close(self) -> None:
         """Ends the live line."""
         self._progress.stop()
-
-    def _start(self) -> None:
-        if not self._progress.live.is_started:
-            self._progress.start()
-            # A killed run would leave it hidden.
-            self._progress.console.show_cursor(True)
 
     def _line(
         self, now: float, seconds: Mapping[str, float], returns: Mapping[str, float]

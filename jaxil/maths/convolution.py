@@ -14,14 +14,7 @@ def convolve_relu(images: Array, kernel: Array, bias: Array, stride: int) -> Arr
 
         y[i, j, f] = max(0, b[f] + sum_{u,v,c} x[s i + u, s j + v, c] k[u, v, c, f])
 
-    Args:
-      images: shape [B, H, W, C].
-      kernel: shape [h, w, C, F].
-      bias: shape [F].
-      stride: s.
-
-    Returns:
-      Shape [B, (H - h) // s + 1, (W - w) // s + 1, F].
+    Maps [B, H, W, C] to [B, (H - h) // s + 1, (W - w) // s + 1, F].
     """
     chex.assert_rank([images, kernel, bias], [4, 4, 1])
     chex.assert_equal(bias.shape[0], kernel.shape[3])
@@ -64,13 +57,8 @@ def tile_gradient(cotangent: Array, kernel: Array, size: tuple[int, ...]) -> Arr
 
         dx[h i + u, w j + v] = k[u, v] dy[i, j]
 
-    Args:
-      cotangent: shape [B, H // h, W // w, F].
-      kernel: shape [h, w, C, F].
-      size: H and W; pixels outside all windows get 0.
-
-    Returns:
-      Shape [B, H, W, C].
+    Maps [B, H // h, W // w, F] to [B, H, W, C] with H, W = `size`; pixels outside all
+    windows get 0.
     """
     chex.assert_rank([cotangent, kernel], 4)
     tiles = jnp.einsum("bijf,uvcf->biujvc", cotangent, kernel)

@@ -31,12 +31,9 @@ def sample_truncated_normal(
 
     Args:
       mean: in [-1, 1]. Shape [..., A].
-      std: standard deviation. Shape [].
+      std: shape [].
       key: consumed.
       noise_clip: c; None does not clip the noise (acting).
-
-    Returns:
-      Actions in (-1, 1), with gradient 1 towards the mean. Shape [..., A].
 
     Source: Yarats et al. 2021, arXiv:2107.09645, eqs. (1) and (2).
     """

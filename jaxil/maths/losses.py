@@ -12,18 +12,14 @@ _NORM_FLOOR = 1e-12  # added under the root: d|g|/dg is undefined at g = 0
 
 
 def td_target(reward: Array, discount: Array, next_values: Array) -> Array:
-    """Returns the clipped double-Q target over n steps.
+    """Returns the clipped double-Q target over n steps, without gradient.
 
         y = R_n + gamma^n * min_k Q_k(o', a')
 
     Args:
       reward: R_n, discounted sum of the window's rewards. Shape [B].
-      discount: gamma^n times the environment's discounts; 0 after a true
-        termination, never after a time limit. Shape [B], in [0, 1].
+      discount: gamma^n times the environment's discounts, in [0, 1]. Shape [B].
       next_values: both target critics after the window. Shape [2, B].
-
-    Returns:
-      Targets, without gradient. Shape [B].
 
     Source: Yarats et al. 2021, arXiv:2107.09645, eq. (1).
     """
@@ -71,12 +67,7 @@ def discriminator_loss(expert_logits: Array, agent_logits: Array) -> Array:
     With logits l = log D - log(1 - D):  -log D = softplus(-l)  and
     -log(1 - D) = softplus(l), both finite for every l.
 
-    Args:
-      expert_logits: on demonstrations. Shape [B].
-      agent_logits: on replay. Shape [B].
-
-    Returns:
-      Mean over the expert's plus mean over the agent's. Shape [].
+    Both batches of logits have shape [B]; the loss is the sum of their means.
 
     Source: Cohen et al. 2021, eq. (7), with the labels that eq. (8) needs: taken
     literally, the two equations would reward the agent for differing from the expert.
@@ -105,9 +96,6 @@ def gradient_penalty(
       agent: the agent's, alike.
       key: consumed.
 
-    Returns:
-      The penalty without its weight. Shape [].
-
     Source: Gulrajani et al. 2017, arXiv:1704.00028, eq. (3).
     """
     chex.assert_trees_all_equal_shapes_and_dtypes(expert, agent)
@@ -135,10 +123,7 @@ def cloning_loss(mean: Array, action: Array, *, std: float) -> Array:
 
         L = mean_b sum_a (x - m)^2 / (2 s^2) + log s + log(2 pi) / 2
 
-    Args:
-      mean: m, of the policy, in [-1, 1]. Shape [B, A].
-      action: x, of the expert. Shape [B, A].
-      std: s, of the policy.
+    with the policy's mean m and fixed std s, and the expert's action x. Shapes [B, A].
 
     Source: siddhanthaldar/ROT, agent/bc.py; the paper gives neither loss nor s.
     """

@@ -11,14 +11,7 @@ _NORM_FLOOR = 1e-8  # keeps the cosine finite for an all-zero feature
 def cosine_cost(x: Array, y: Array) -> Array:
     """Returns pairwise cosine distances.
 
-        C_ij = 1 - <x_i, y_j> / (|x_i| |y_j|)
-
-    Args:
-      x: agent features. Shape [T, D].
-      y: expert features. Shape [N, D].
-
-    Returns:
-      Costs in [0, 2]. Shape [T, N].
+        C_ij = 1 - <x_i, y_j> / (|x_i| |y_j|)   of x [T, D] and y [N, D], in [0, 2]
 
     Source: Cohen et al. 2021, eq. (2).
     """
@@ -52,9 +45,7 @@ def simultaneous_plan(cost: Array, expert_mass: Array) -> Array:
 
         P_tn = 1/T  for  n = min(t, number of expert steps - 1),  else 0
 
-    Args:
-      cost: only its shape is used. Shape [T, N].
-      expert_mass: zero beyond the expert's own steps. Shape [N].
+    Only the shape of `cost` is used; `expert_mass` is 0 beyond the expert's own steps.
 
     Source: Cohen et al. 2021, fig. 7.
     """
@@ -116,7 +107,7 @@ def sinkhorn_plan(
 def sinkhorn_divergence(
     x: Array, y: Array, *, epsilon: float, num_iterations: int
 ) -> Array:
-    """Returns the debiased Sinkhorn divergence of two sets of uniform points.
+    """Returns the debiased Sinkhorn divergence of two sets of points [., D].
 
         S(x, y) = OT(x, y) - (OT(x, x) + OT(y, y)) / 2,   with cosine costs C and
         OT(x, y) = min_P <P, C> + epsilon * KL(P | a b^T),   P 1 = a,  P^T 1 = b
@@ -124,11 +115,7 @@ def sinkhorn_divergence(
     Entropy blurs the plan, so OT(x, x) > 0. S is symmetric, zero between a set and
     itself and, for these costs, never negative.
 
-    Args:
-      x: shape [T, D].
-      y: shape [N, D].
-      epsilon: weight of the entropy, in units of cost.
-      num_iterations: Sinkhorn iterations; static under jit.
+    See `sinkhorn_plan` for the arguments.
 
     Source: Feydy et al. 2019, Interpolating between Optimal Transport and MMD using
     Sinkhorn Divergences, eq. (1), (3) and theorem 1.

@@ -58,9 +58,7 @@ def register(library: ctypes.CDLL) -> None:
 def build(folder: pathlib.Path, flags: tuple[str, ...] = FLAGS) -> pathlib.Path:
     """Returns the path of the library, compiled if it is missing or damaged.
 
-    Args:
-      folder: created if missing; processes and machines may share it.
-      flags: for the compiler.
+    The folder is created if missing; processes and machines may share it.
 
     Raises:
       BuildError: there is no compiler, or it failed.

@@ -17,9 +17,7 @@ class PixelEncoder(nn.Module):
         x = contrast * (pixels / 255 - mean)
 
     Attributes:
-      channels: output channels of each layer.
-      kernel_sizes: side of each layer's square kernel.
-      strides: stride of each layer.
+      channels, kernel_sizes, strides: of each layer.
       contrast: factor on the centred pixels; 1 in the paper.
       mean: in [0, 1]: 0.5 in the paper, or an image [H, W, C] as nested tuples or an
         array.

@@ -24,12 +24,7 @@ class DeviceCopy:
     """
 
     def __init__(self, replay: Replay, *, block_frames: int = _BLOCK_FRAMES) -> None:
-        """Allocates the memory and copies what is stored already.
-
-        Args:
-          replay: must not be cleared from now on.
-          block_frames: frames sent at a time, >= 1.
-        """
+        """Copies a replay, which must not be cleared from now on."""
         self._replay = replay
         self._block_frames = min(block_frames, len(replay.frames))
         self._num_episodes = 0

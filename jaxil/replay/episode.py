@@ -6,14 +6,9 @@ from jaxil.maths.types import Episode
 
 
 def checked_episode(frames, actions, rewards, discounts, *, like: Episode) -> Episode:
-    """Returns the arrays of an episode, converted to the dtypes that are stored.
+    """Returns the arrays of an episode, converted to the dtypes of `like`.
 
-    Args:
-      frames: see `Episode`; its dtype is not converted.
-      actions: finite real numbers, as are the next two.
-      rewards: see `Episode`.
-      discounts: in [0, 1].
-      like: arrays with the right dtypes, and the right shapes after the first axis.
+    Frames are not converted. Only the first axis may differ from `like`.
 
     Raises:
       ValueError: for a wrong shape or dtype, or a number that is out of range.

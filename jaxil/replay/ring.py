@@ -34,7 +34,7 @@ class EpisodeRing:
 
         Args:
           capacity_steps: transitions to keep, >= episode_steps.
-          episode_steps: transitions of a usual episode (see `ring_slots`), >= 1.
+          episode_steps: transitions of a usual episode, >= 1.
           observation_shape: of a single frame, (H, W, C), or of a state, (S,).
           observation_dtype: uint8 for pixels, float32 for states.
           action_dim: A >= 1.
@@ -170,11 +170,7 @@ class EpisodeRing:
         )
 
     def slots(self, index: int) -> np.ndarray:
-        """Returns the indices of an episode's frames in `frames`, [T + 1].
-
-        Raises:
-          IndexError: if it is not stored.
-        """
+        """Returns an episode's indices in `frames`, [T + 1], or raises IndexError."""
         if index not in self._stored:
             raise IndexError(
                 f"episode {index} is not stored: the replay holds"
