@@ -1,6 +1,4 @@
-r"""DrQ-v2 from pixels on the true reward: the backbone.
-
-The paper's experts are runs of this learner, whose exact settings it does not give.
+r"""DrQ-v2 from pixels on the true reward, the learner of all other methods.
 
 python -m jaxil.launch --config=configs/drqv2.py:cheetah_run --workdir=runs/drqv2
 """

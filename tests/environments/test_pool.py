@@ -58,7 +58,9 @@ def without_jax(make):
     return environment
 
 
-def play(environments, num_episodes, act=lambda seen: seen[:, :1] % 10, each_round=None):
+def play(
+    environments, num_episodes, act=lambda seen: seen[:, :1] % 10, each_round=None
+):
     """Plays whole episodes; returns them by number."""
     player, whole = Player(environments, first_episode=0), {}
     for number in range(100):

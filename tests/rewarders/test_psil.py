@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from jaxil.maths import augmentation, transport
+from jaxil.maths import stacking, transport
 from jaxil.networks.agent import actor_features
 from jaxil.rewarders import psil
 from jaxil.rewarders.matching import closest_rewards, make_matching
@@ -149,7 +149,7 @@ def test_rewards_step_by_step(frame_stack):
     params, frames = make_params(0, frame_stack), random_frames(1, STEPS + 1)
 
     def features(frames):
-        stacks = augmentation.stack_frames(frames, frame_stack=frame_stack)
+        stacks = stacking.stack_frames(frames, frame_stack=frame_stack)
         return actor_features(NETWORKS, params.encoder, params.actor, stacks)
 
     candidates = []

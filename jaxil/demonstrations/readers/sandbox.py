@@ -4,6 +4,7 @@ Parsers written in C may crash or hang on hostile files; the parent then raises
 FormatError.
 """
 
+import contextlib
 import os
 import pathlib
 from collections.abc import Callable, Iterator
@@ -17,7 +18,7 @@ from jaxil.demonstrations.readers.recording import (
     Recording,
     checked,
 )
-from jaxil.machine.child import Child, ChildError
+from jaxil.machine import child
 
 _CPU_SECONDS = 20  # per item of a small file
 _BYTES_PER_SECOND = 10e6  # read and parsed on a slow machine
@@ -45,7 +46,7 @@ def read_in_child(
     file_bytes = path.stat().st_size if path.is_file() else 0
     cpu_seconds = _CPU_SECONDS + round(file_bytes / _BYTES_PER_SECOND)
     try:
-        with Child(
+        items = child.results(
             _serve,
             read,
             path.absolute(),
@@ -54,12 +55,13 @@ def read_in_child(
             cpu_seconds=cpu_seconds,
             # A whole pickle is in memory, parts of it twice.
             memory_bytes=_MEMORY_BYTES + 2 * options.max_bytes + 3 * file_bytes,
-            answer_bytes=2 * options.max_bytes,
-        ) as child:
-            for content in child:
+            result_bytes=2 * options.max_bytes,
+        )
+        with contextlib.closing(items):
+            for content in items:
                 kind = Recording if content and "kind" in content else PixelEpisode
                 yield content and kind(**content)
-    except ChildError as error:
+    except child.ChildError as error:
         reason = _REASONS.get(error.kind, "is cut off or damaged ({kind}: {text})")
         raise FormatError(reason.format(kind=error.kind, text=error.text)) from error
 
