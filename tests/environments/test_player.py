@@ -36,7 +36,7 @@ def environments(lengths, size, lost=()):
 
 
 def play(player, count, rounds=1000):
-    """Plays until episodes are used up, or for some rounds; returns those that ended."""
+    """Plays all episodes, or some rounds; returns those that ended."""
     finished = []
     for _ in range(rounds):
         player.begin(lambda number: number < count)
