@@ -70,7 +70,8 @@ def main(argv: list[str]) -> None:
             "name a folder of yours on a disk with room"
         ) from error
     size = (output / "index.html").stat().st_size / 1e6
-    print(f"{output / 'index.html'}: {len(found)} runs, {size:.1f} MB")
+    index = runs.printable(output / "index.html")
+    print(f"{index}: {len(found)} runs, {size:.1f} MB")
 
 
 def _named_runs(argv: list[str]) -> list[str]:

@@ -155,7 +155,7 @@ def test_what_is_missing_of_the_papers_figures(folder):
     text = (folder / "index.html").read_text()
     # Of 8 tasks, 5 methods and 4 seeds: 3 + 2 on cartpole; 1 + 0 on walker, where the
     # two that differ in batch size have the same seed.
-    assert "6 of 160 runs are finished" in text
+    assert "6 of\n160 runs are finished" in text
     assert (
         "python launch/sweep.py --ablation=figure6 --tasks=cartpole_swingup,"
         "finger_spin,ball_in_cup_catch,acrobot_swingup,cheetah_run,walker_stand,"

@@ -14,7 +14,6 @@ class PaperFigure(NamedTuple):
     Attributes:
       figure: which.
       sheet: the plots; None where no runs show what it is about.
-      cells: rows of a table: each task, then "finished of wanted" for each variant.
       num_finished: finished seeds of all tasks and variants, none beyond those wanted.
       num_wanted: how many there should be.
       command: trains what is missing; empty if nothing is.
@@ -22,7 +21,6 @@ class PaperFigure(NamedTuple):
 
     figure: Figure
     sheet: Sheet | None
-    cells: list[list[str]]
     num_finished: int
     num_wanted: int
     command: str
@@ -44,26 +42,12 @@ def _figure(groups: list[Group], figure: Figure, num_seeds: int) -> PaperFigure:
         for group in groups
         if group.task in figures.TASKS and group.variant in figure.variants
     ]
-    cells, missing, num_finished = [], [], 0
+    missing, num_finished = [], 0
     for task in figures.TASKS:
-        row = [task]
-        for variant in figure.variants:
-            runs = [
-                run
-                for group in own
-                if (group.task, group.variant) == (task, variant)
-                for run in group.runs
-            ]
-            finished = {run.seed for run in runs if run.is_finished}
-            begun = {run.seed for run in runs} - finished
-            count = min(len(finished), num_seeds)
-            num_finished += count
-            row.append(
-                f"{count}/{num_seeds}" + (f" + {len(begun)} begun" if begun else "")
-            )
-            if count < num_seeds and task not in missing:
-                missing.append(task)
-        cells.append(row)
+        counts = [_num_finished(own, task, v, num_seeds) for v in figure.variants]
+        num_finished += sum(counts)
+        if min(counts) < num_seeds:
+            missing.append(task)
     command = (
         f"python launch/sweep.py --ablation=figure{figure.number} "
         f"--tasks={','.join(missing)} --seeds={num_seeds} --workdir=DIR"
@@ -73,11 +57,23 @@ def _figure(groups: list[Group], figure: Figure, num_seeds: int) -> PaperFigure:
     return PaperFigure(
         figure,
         _sheet(figure, own) if shows else None,
-        cells,
         num_finished,
         len(figure.variants) * len(figures.TASKS) * num_seeds,
         command if missing else "",
     )
+
+
+def _num_finished(
+    groups: list[Group], task: str, variant: figures.Variant, most: int
+) -> int:
+    """Returns how many seeds of a variant are finished on a task, at most `most`."""
+    runs = [
+        run
+        for group in groups
+        if (group.task, group.variant) == (task, variant)
+        for run in group.runs
+    ]
+    return min(len({run.seed for run in runs if run.is_finished}), most)
 
 
 def _sheet(figure: Figure, groups: list[Group]) -> Sheet | None:

@@ -59,14 +59,7 @@ def curves(
 
 
 def bars(axes: Any, finals: Sequence[Final]) -> None:
-    """Plots the mean of the last evaluations, a dot for each seed.
-
-    Hatched where a run is unfinished.
-
-    Args:
-      axes: Matplotlib's.
-      finals: at least one.
-    """
+    """Plots the mean of the last evaluations, hatched where a run is unfinished."""
     experts = sorted({round(f.expert, 1) for f in finals if np.isfinite(f.expert)})
     highest = max([1.0, *experts, *(float(f.returns.max()) for f in finals)])
     bounds = [float(f.mean.high) for f in finals if np.isfinite(f.mean.high)]
@@ -90,7 +83,7 @@ def bars(axes: Any, finals: Sequence[Final]) -> None:
             edgecolor="#ffffff88",
         )
         if np.isfinite(high):
-            axes.plot([low, high], [y, y], color=INK, lw=1.3, zorder=4)
+            axes.plot([low, min(high, highest)], [y, y], color=INK, lw=1.3, zorder=4)
         dots = {"ls": "", "marker": "o", "ms": 3.6, "mew": 0.8, "zorder": 5}
         heights = np.full(len(final.returns), y)
         axes.plot(final.returns, heights, mfc=colour, mec=INK, **dots)
@@ -147,7 +140,7 @@ def rewards(axes: Any, imitation: np.ndarray, task: np.ndarray, colour: str) -> 
         other = axes.twinx()
         other.plot(np.arange(len(task)), task, color=INK, lw=0.9, alpha=0.6)
         other.set_ylabel("task reward")
-        other.set_ylim(min(0.0, float(np.nanmin(task))), _above(task))
+        other.set_ylim(min(0.0, float(np.nanmin(task))))
         other.spines[["top", "left"]].set_visible(False)
 
 
@@ -215,7 +208,3 @@ def _horizontal(axes: Any, right: float, over: str) -> None:
         axes.set_xlabel("environment frames")
     else:
         axes.set_xlabel("hours")
-
-
-def _above(values: np.ndarray) -> float:
-    return max(1.05 * float(np.nanmax(values)), 1e-3)

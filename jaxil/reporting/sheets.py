@@ -121,12 +121,12 @@ def _figure(
     from matplotlib.lines import Line2D
 
     columns = min(_COLUMNS, len(panels))
-    rows = -(-len(panels) // columns)
     is_long = any(len(label) > _LEGEND_WIDTH for label, _ in legend)
     legend_columns = 1 if is_long else columns
     legend_height = _LEGEND_LINE * -(-len(legend) // legend_columns)
-    cell = max(panel.height for panel in panels) + title
-    width, height = _WIDTH * columns, cell * rows + legend_height
+    firsts = range(0, len(panels), columns)
+    rows = [title + max(p.height for p in panels[k : k + columns]) for k in firsts]
+    width, height = _WIDTH * columns, sum(rows) + legend_height
     figure = Figure(figsize=(width, height), dpi=150)
     FigureCanvasAgg(figure)
     axes = []
@@ -134,7 +134,7 @@ def _figure(
         row, column = divmod(index, columns)
         left, right = panel.margins
         across, high = _WIDTH - left - right, panel.height - _TOP - _BOTTOM
-        x, y = column * _WIDTH + left, height - row * cell - title - _TOP - high
+        x, y = column * _WIDTH + left, height - sum(rows[:row]) - title - _TOP - high
         box = (x / width, y / height, across / width, high / height)
         axes.append(figure.add_axes(box))
     if legend:

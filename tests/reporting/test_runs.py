@@ -1,6 +1,7 @@
 """Runs are read however little of them there is, and grouped by what they are."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -135,6 +136,16 @@ def test_what_is_no_config_is_refused(tmp_path, text):
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(runs.UnreadableError):
         runs.read(tmp_path)
+
+
+def test_pipes_are_refused_not_waited_for(tmp_path):
+    folder = write_run(tmp_path / "run", "pdac", "walker_walk", 0, None)
+    os.mkfifo(folder / "eval.csv")
+    assert any("eval.csv cannot be read" in r for r in runs.read(folder).remarks)
+    (folder / "config.json").unlink()
+    os.mkfifo(folder / "config.json")
+    with pytest.raises(runs.UnreadableError, match="cannot be read"):
+        runs.read(folder)
 
 
 def test_fields_of_an_older_config_have_defaults_or_are_ignored(tmp_path):
