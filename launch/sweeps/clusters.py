@@ -136,7 +136,7 @@ def start(
         return
     here = pathlib.Path.cwd()
     shares = places(cluster, len(runs))
-    workers = [Worker(runs, place, folder=here) for place in shares]
+    workers = [Worker(runs, place, here) for place in shares]
     for worker in workers:
         # Daemons, so that another Ctrl-C ends the sweep; its runs then still save.
         threading.Thread(target=worker.work, daemon=True).start()
@@ -220,11 +220,8 @@ def submit(cluster: Cluster, runs: Sequence[Run], logs: pathlib.Path) -> None:
     here = pathlib.Path.cwd()
     for first in range(0, len(runs), _ARRAY_SIZE):
         some = runs[first : first + _ARRAY_SIZE]
-        made = [
-            Job([run], Place(), folder=here, patience_seconds=_PATIENCE_SECONDS)
-            for run in some
-        ]
-        for run, job in zip(some, executor.submit_array(made), strict=True):
+        jobs = [Job([run], Place(), here, _PATIENCE_SECONDS) for run in some]
+        for run, job in zip(some, executor.submit_array(jobs), strict=True):
             state.note_slurm_job(run, job.job_id)
 
 

@@ -5,6 +5,7 @@ its leftover memory touches the next one.
 """
 
 import contextlib
+import dataclasses
 import os
 import pathlib
 import signal
@@ -12,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from jaxil.files import locking
 from launch.sweeps import state
@@ -44,57 +45,35 @@ class Place(NamedTuple):
     environment: tuple[tuple[str, str], ...] = ()  # variables to be set
 
 
+@dataclasses.dataclass(eq=False)
 class Worker:
-    """Takes runs from a list that other workers share, until none is left.
+    """Takes runs from a list that other workers share, until none is left."""
 
-    Attributes:
-      must_stop: set it to have the current run saved and the worker end.
-      has_ended: whether it has nothing left to do.
-    """
-
-    pause_seconds = 0.0  # before a run is asked to stop
-
-    def __init__(
-        self,
-        runs: Sequence[Run],
-        place: Place,
-        *,
-        folder: pathlib.Path,
-        patience_seconds: float = float("inf"),
-    ) -> None:
-        """Prepares.
-
-        Args:
-          runs: to be done; finished and failed ones are passed over.
-          place: where.
-          folder: that the commands are seen from.
-          patience_seconds: how long to wait for runs that others have: they may leave
-            them unfinished.
-        """
-        self.must_stop = False
-        self.has_ended = False
-        self._runs = runs
-        self._place = place
-        self._folder = folder
-        self._patience_seconds = patience_seconds
+    runs: Sequence[Run]  # finished and failed ones are passed over
+    place: Place
+    folder: pathlib.Path  # that the commands are seen from
+    patience_seconds: float = float("inf")  # with runs that others have and may leave
+    must_stop: bool = False  # set it to have the current run saved and the worker end
+    has_ended: bool = False
+    pause_seconds: ClassVar[float] = 0.0  # before a run is asked to stop
 
     def work(self) -> None:
         """Does the runs."""
         try:
-            if self._place.cores:  # of this thread, and of what it starts
-                os.sched_setaffinity(0, self._place.cores)
+            if self.place.cores:  # of this thread, and of what it starts
+                os.sched_setaffinity(0, self.place.cores)
             self._work()
         finally:
             self.has_ended = True
 
     def _work(self) -> None:
-        left = list(self._runs)
+        left = list(self.runs)
         last_change = time.monotonic()
         while left and not self.must_stop:
             held = [run for run in left if self.must_stop or not self._do(run)]
             if len(held) < len(left):
                 last_change = time.monotonic()
-            elif time.monotonic() - last_change > self._patience_seconds:
+            elif time.monotonic() - last_change > self.patience_seconds:
                 return
             left = held
             if left and not self.must_stop:
@@ -127,8 +106,8 @@ class Worker:
             log.flush()
             process = subprocess.Popen(
                 [sys.executable, "-IS", "-c", _STARTER, *run.command],
-                cwd=self._folder,
-                env={**os.environ, **path, **limits, **dict(self._place.environment)},
+                cwd=self.folder,
+                env={**os.environ, **path, **limits, **dict(self.place.environment)},
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
