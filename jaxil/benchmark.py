@@ -133,12 +133,7 @@ def _define(values: flags.FlagValues) -> None:
         ("steps", 40, 2, "agent steps to time of the loop, with and without overlap"),
     ):
         flags.DEFINE_integer(
-            name,
-            default,
-            meaning,
-            lower_bound=lowest,
-            upper_bound=1_000_000,
-            flag_values=values,
+            name, default, meaning, lowest, upper_bound=10**6, flag_values=values
         )
 
 

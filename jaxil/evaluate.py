@@ -53,26 +53,17 @@ def main(argv: list[str]) -> None:
             expert_frames = run.demonstrations.frames[0]
     print(line)
     assert evaluation.video is not None
-    (folder / "videos").mkdir(exist_ok=True)
     path = folder / "videos" / "evaluation.mp4"
-    write_video(
-        path,
-        evaluation.video,
-        expert_frames,
-        fps=run_log.frames_per_second(len(evaluation.video)),
-    )
+    path.parent.mkdir(exist_ok=True)
+    fps = run_log.frames_per_second(len(evaluation.video))
+    write_video(path, evaluation.video, expert_frames, fps=fps)
     print(f"video: {path}")
 
 
 def _define(values: flags.FlagValues) -> None:
     flags.DEFINE_string("workdir", None, "folder of the run", flag_values=values)
     flags.DEFINE_integer(
-        "num_episodes",
-        10,
-        "episodes to play",
-        lower_bound=1,
-        upper_bound=100_000,
-        flag_values=values,
+        "num_episodes", 10, "episodes to play", 1, 100_000, flag_values=values
     )
 
 

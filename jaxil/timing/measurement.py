@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import pathlib
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -14,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxil.config import Config
-from jaxil.machine import devices, memory
+from jaxil.machine import devices, memory, screen
 from jaxil.timing import start
 from jaxil.timing.bench import Bench, num_bytes
 
@@ -50,7 +49,7 @@ def measure(
     """
     with (
         tempfile.TemporaryDirectory() as folder,
-        contextlib.closing(Bench(config, pathlib.Path(folder), _say)) as bench,
+        contextlib.closing(Bench(config, pathlib.Path(folder), screen.say)) as bench,
     ):
         results: dict[str, Any] = {"ranges": {}}
         for name, (function, num_calls) in bench.parts().items():
@@ -65,7 +64,7 @@ def measure(
         results |= dict.fromkeys(("start_seconds", "compile_cold_seconds"))
         if environment is not None:
             results["start_seconds"] = start.first_step_seconds(
-                config, environment, _say
+                config, environment, screen.say
             )
             results["compile_cold_seconds"] = start.compile_seconds(bench.lower)
         frames = len(bench.episode.actions) * config.action_repeat
@@ -155,7 +154,3 @@ def timed(function: Callable[[], Any], repeats: int) -> Timing:
         jax.block_until_ready(function())
         seconds.append(time.perf_counter() - begin)
     return Timing(float(np.median(seconds)), min(seconds), max(seconds))
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
