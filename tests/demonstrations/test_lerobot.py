@@ -154,7 +154,7 @@ ROW_FAULTS = {
     "an episode twice": (
         EPISODES_FILE,
         set_row(1, episode_index=0),
-        "not those from 0",
+        "has 3 episodes, not",
     ),
     "words": (
         EPISODES_FILE,
