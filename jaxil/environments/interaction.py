@@ -14,21 +14,27 @@ class Environment(Protocol):
     @property
     def episode_steps(self) -> int | None:
         """Agent steps of a whole episode; None without a time limit."""
+        ...
 
     def observation_spec(self) -> specs.Array:
         """Returns the spec of observations: uint8 [H, W, C] or float32 [S]."""
+        ...
 
     def action_spec(self) -> specs.BoundedArray:
         """Returns the spec of actions: float32 [A] in [-1, 1]."""
+        ...
 
     def reset(self, episode: int) -> dm_env.TimeStep:
         """Starts an episode, whose number determines the initial state."""
+        ...
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
         """Applies an action; the discount stays 1 at a time limit."""
+        ...
 
     def single_observation(self) -> np.ndarray:
         """Returns the current frame, not stacked: uint8 [H, W, 3] or float32 [S]."""
+        ...
 
 
 class Moment(NamedTuple):
@@ -54,6 +60,7 @@ class Environments(Protocol):
 
     def receive(self, index: int) -> Moment | None:
         """Waits for the result; None if the simulator and its episode are lost."""
+        ...
 
     def close(self) -> None:
         """Ends their processes."""

@@ -231,7 +231,7 @@ def test_samples_come_from_every_own_frame_and_no_filling(path):
         episodes.append(PixelEpisode(frames.copy(), actions))
     write(path, episodes)
     loaded = load(path)
-    observations, actions = loading.sample(
+    observations, actions, _ = loading.sample(
         loaded, np.random.default_rng(0), 500, frame_stack=2
     )
     newest = observations[:, 0, 0, -1]
@@ -249,8 +249,10 @@ def test_what_only_some_episodes_have_is_left_out(path):
     assert loaded.actions is None
     assert loaded.task_rewards is None
     assert loaded.mean_return() is None
-    drawn, actions = loading.sample(loaded, np.random.default_rng(0), 4, frame_stack=1)
-    assert drawn.shape == (4, 8, 8, 3)
+    sampled, actions, _ = loading.sample(
+        loaded, np.random.default_rng(0), 4, frame_stack=1
+    )
+    assert sampled.shape == (4, 8, 8, 3)
     assert actions.shape == (4, 0)
 
 

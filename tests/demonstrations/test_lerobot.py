@@ -154,7 +154,7 @@ ROW_FAULTS = {
     "an episode twice": (
         EPISODES_FILE,
         set_row(1, episode_index=0),
-        "not those from 0",
+        "has 3 episodes, not",
     ),
     "words": (
         EPISODES_FILE,
@@ -194,9 +194,9 @@ ROW_FAULTS = {
         set_row(0, length=2),
         "does not have the 2 rows of episode 0 in file-000.parquet",
     ),
-    "a frame twice": (DATA_FILE, set_row(1, frame_index=0), "the 2 rows of"),
-    "another episode": (DATA_FILE, set_row(0, episode_index=1), "the 2 rows of"),
-    "no rows": (DATA_FILE, lambda rows: rows[:3], "the 2 rows of"),
+    "a frame twice": (DATA_FILE, set_row(1, frame_index=0), "does not have the"),
+    "another episode": (DATA_FILE, set_row(0, episode_index=1), "does not have the"),
+    "no rows": (DATA_FILE, lambda rows: rows[:3], "does not have the"),
     "no action": (
         DATA_FILE,
         set_row(1, action=None),

@@ -357,7 +357,7 @@ def test_large_jpegs_are_refused_before_they_are_decoded(tmp_path):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"data_format": "arrow"}, "data_format='arrow'; only 'hdf5' can be read"),
+        ({"data_format": "arrow"}, "data_format='arrow', not 'hdf5'"),
         ({"total_episodes": 3}, r"holds 2 episodes, but metadata.json says 3"),
         ({"total_episodes": [2]}, r"says \[2\]"),
     ],

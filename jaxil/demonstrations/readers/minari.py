@@ -128,8 +128,8 @@ def _image_in(episode: Any) -> str:
     images = [p for p, x in datasets.items() if _is_plain(x) or _is_jpeg(x)]
     if len(images) != 1:
         listed = ", ".join(f"{p} of {x.dtype} {x.shape}" for p, x in datasets.items())
-        found = f"{len(images)} images, uint8 [H, W, 3], in an observation"
-        raise FormatError(f"has {found}, not one: {listed}")
+        what = f"{len(images)} images, uint8 [H, W, 3], in an observation"
+        raise FormatError(f"has {what}, not one: {listed}")
     return images[0]
 
 

@@ -72,7 +72,7 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
         kind="jaxil pixels",
         num_episodes=num_episodes,
         notes=(f"Origin: {metadata['origin']}.",),
-        **{name: metadata.get(name) for name in _OPTIONAL},
+        **{name: metadata[name] for name in _OPTIONAL},
     )
     for index in range(num_episodes):
         names = {name: f"{name}_{index}" for name in ("frames", "actions", "rewards")}
@@ -80,7 +80,8 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
         limits = dict.fromkeys(names.values(), options.max_bytes)
         with naming(path, path):
             arrays = archive.read_archive(path, max_bytes=limits)
-        yield PixelEpisode(**{name: arrays[names[name]] for name in names})
+        known = {name: arrays[names[name]] for name in names}
+        yield PixelEpisode(stored_size=None, **known)
 
 
 def _read_metadata(path: pathlib.Path) -> dict[str, Any]:
@@ -100,4 +101,4 @@ def _read_metadata(path: pathlib.Path) -> dict[str, Any]:
             raise FormatError(f"has metadata {name}={value!r}, not {kind.__name__}")
     if not isinstance(metadata.get("origin"), str):
         raise FormatError("has metadata without origin")
-    return metadata
+    return {**dict.fromkeys(_OPTIONAL), **metadata}
