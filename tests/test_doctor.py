@@ -208,8 +208,8 @@ def test_the_advised_replay_fits(monkeypatch, config):
     assert one(doctor.memory(config), "memory").level == "ok"
 
 
-def test_demonstrations_that_cannot_be_used(monkeypatch, config, tmp_path):
-    config.method = "pdac"
+def test_demonstrations_that_cannot_be_used(monkeypatch, tmp_path):
+    config = jaxil_config.default_config("pdac")
     config.demonstrations.source = str(tmp_path / "none.npz")
     findings = list(doctor.demonstrations(config))
     assert findings[-1].level == "fault"
