@@ -1,4 +1,4 @@
-r"""DrQ-v2 from pixels on the true reward: the backbone, and the paper's experts.
+r"""DrQ-v2 from pixels on the true reward, the learner of all other methods.
 
 python -m jaxil.launch --config=configs/drqv2.py:cheetah_run --workdir=runs/drqv2
 """

@@ -1,16 +1,16 @@
-r"""An expert in minutes: DrQ-v2's learner on the state vector, with the true reward.
+r"""Experts in minutes: DrQ-v2's learner on the state vector, with the true reward.
 
     python -m jaxil.launch --config=configs/expert.py:cartpole_swingup \
         --workdir=runs/expert
     python -m jaxil.collect --workdirs=runs/expert --output=cartpole_swingup.npz
 
-It sees the simulator's own observation in place of pixels, through one hidden layer in
-place of convolutions, and runs at some 500 frames per second on one CPU core.
+It uses the simulator's observation instead of pixels, and one hidden layer instead of
+convolutions: about 500 frames per second on one CPU core.
 """
 
 from jaxil import config as jaxil_config
 
-# Frames until an expert is good enough to be imitated: those of the shipped ones.
+# Enough frames for an expert worth imitating; those of the included demonstrations.
 _FRAMES = {
     "ball_in_cup_catch": 80_000,
     "cartpole_swingup": 100_000,
@@ -21,8 +21,8 @@ _FRAMES = {
     "cheetah_run": 1_500_000,
 }
 _MANY_FRAMES = 1_000_000
-# Agent steps until exploration has faded. A finger that spins slowly is paid for it,
-# and has to go on trying for longer.
+# Agent steps until exploration has decayed. A slowly spinning finger is rewarded too,
+# so it has to explore for longer to spin faster.
 _EXPLORATION_STEPS = {
     "ball_in_cup_catch": 50_000,
     "cartpole_swingup": 50_000,
@@ -30,10 +30,10 @@ _EXPLORATION_STEPS = {
     "finger_spin": 150_000,
 }
 _LONG_EXPLORATION_STEPS = 100_000
-# Three rewards in one step speed most tasks up; a finger that has to hit in time is
-# held back by those that older, noisier policies earned.
+# 3-step returns speed up most tasks. The finger has to hit at the right time, where the
+# rewards of older, noisier policies mislead.
 _NUM_STEPS = {"finger_spin": 1}
-# Without it the actor saturates; see `losses.saturation_penalty`.
+# Prevents saturation of the actor, see `losses.saturation_penalty`.
 _PENALTIES = {"finger_spin": 1e-2}
 _PENALTY = 3e-3
 

@@ -2,11 +2,7 @@ r"""P-DAC on walker_walk from ten pixel demonstrations, as in the paper.
 
     python -m jaxil.launch --config=configs/pdac_walker.py --workdir=runs/pdac
 
-Change one thing from the command line:
-
-    ... --config.seed=3 --config.discriminator.gradient_penalty=5.0
-
-Needs a GPU, or days: 5 million frames, 1.25 million updates of batch 256.
+Needs a GPU: 5 million frames, 1.25 million updates of batch 256.
 """
 
 from jaxil import config as jaxil_config

@@ -1,12 +1,8 @@
 r"""P-SIL on walker_walk from ten pixel demonstrations, as in the paper.
 
-    python -m jaxil.launch --config=configs/pdac_walker.py --workdir=runs/psil
+    python -m jaxil.launch --config=configs/psil_walker.py --workdir=runs/psil
 
-Change one thing from the command line:
-
-    ... --config.seed=3 --config.sinkhorn.epsilon=0.02
-
-Needs a GPU, or days: 5 million frames, 1.25 million updates of batch 256.
+Needs a GPU: 5 million frames, 1.25 million updates of batch 256.
 """
 
 from jaxil import config as jaxil_config

@@ -3,25 +3,28 @@ r"""The preset that learns on two CPU cores: `configs/tiny.py:METHOD,TASK`.
     python -m jaxil.launch --config=configs/tiny.py:pdac,ball_in_cup_catch \
         --workdir=runs/tiny
 
-The paper's methods with smaller images, networks and batches, and without shadows. What
-else differs from the paper, and why: the demonstrations' mean image is subtracted and
-the contrast raised, since a small moving body is a few pixels at 48x48; the squared
-pre-tanh mean is penalised, since small actors saturate for good; exploration ends
-sooner and an update follows each decision, since minutes are scarcer than frames; the
-replay is smaller, so that stored rewards follow the faster discriminator.
+The paper's methods with smaller images, networks and batches, and rendering without
+shadows. Other deviations from the paper:
 
-On cartpole_swingup an action is repeated 4 times: at 48 pixels a pole that turns by
-1 rad/s moves a quarter of a pixel between frames 0.02 s apart, so at 2 repeats nothing
-shows its speed, and agents learn to spin it and no more; at 8 none learned to hold it.
-P-DAC's gradient penalty has weight 1 there.
+- The mean image of the demonstrations is subtracted and the contrast raised, since a
+  small moving body is only a few pixels at 48x48.
+- The squared pre-tanh mean is penalised, since small actors saturate permanently.
+- Exploration ends sooner, the agent updates every step and learning rates are higher,
+  since runs have to be short.
+- The replay is smaller, so that its rewards are newer, and they are recomputed
+  (`reward_refresh_steps = 2_500`): those of the first episodes come from an untrained
+  discriminator and would teach the critic that random behaviour is best.
+- cartpole_swingup repeats actions 4 times: with 2, a pole at 1 rad/s moves a quarter of
+  a pixel between frames, which hides its speed, and agents only learned to spin it;
+  with 8, none learned to balance it. P-DAC's gradient penalty has weight 1 there.
 """
 
 from jaxil import config as jaxil_config
 
 _ACTION_REPEATS = {"cartpole_swingup": 4}
 _GRADIENT_PENALTIES = {("pdac", "cartpole_swingup"): 1.0}
-# Each sample costs these two a pass through convolutions of the discriminator's own,
-# DAC a second derivative of it as well: at 64, an update takes five times as long.
+# These two have a separate encoder, and DAC needs its second derivatives: with 64, an
+# update takes five times as long.
 _DISCRIMINATOR_BATCHES = {"dac": 16, "sil": 16}
 
 
@@ -50,7 +53,7 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     config.learning_rate = 3e-4
     config.pre_tanh_penalty = 2e-3
     config.replay_size_steps = 50_000
-    config.replay_on_device = True  # on a CPU too: XLA stacks faster than NumPy
+    config.replay_on_device = True  # also on CPUs, where XLA stacks faster than NumPy
     config.exploration_std_steps = 50_000
     own = config.get("discriminator", {})
     if "hidden_dim" in own:
@@ -69,7 +72,7 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     config.checkpoint_every_frames = 10_000
     if "cloning" in config:
         config.cloning.batch_size = 64
-    if config.action_repeat > 2:  # fewer decisions in as many frames
+    if config.action_repeat > 2:  # fewer agent steps in as many frames
         config.exploration_steps = 500
         config.exploration_std_steps = 20_000
         config.replay_size_steps = 25_000

@@ -1,13 +1,12 @@
-r"""Measures time and memory of each part of a run on this machine, and of its loop.
+r"""Measures time and memory of each part of a run on this machine.
 
     python -m jaxil.benchmark --config=configs/pdac_walker.py --json=benchmark.json
     python -m jaxil.benchmark --config=configs/pdac_walker.py --compare=benchmark.json
     python -m jaxil.benchmark --config=configs/pdac_walker.py \
         --sweep=batch_size:64,128,256 --json=batch_sizes.json
 
-Times are medians over repeats, after a warm-up. Nothing is kept. Compiling without a
-cache, and starting a run in a separate process, are timed last; --nostart skips both,
-and so does a sweep.
+Times are medians over repeats, after a warm-up. The run is not kept. Compiling without
+a cache and starting a run are timed last, unless --nostart or --sweep is given.
 """
 
 import json
@@ -27,7 +26,7 @@ _EXAMPLE = "such as --sweep=batch_size:64,128,256"
 def main(argv: list[str]) -> None:
     """Runs the command."""
     values = command.parse(argv, __doc__ or "", _define)
-    environment = dict(os.environ)  # as a new process would get it
+    environment = dict(os.environ)  # before `prepare` changes it
     from jaxil.machine import startup
 
     print(startup.prepare(), file=sys.stderr, flush=True)
@@ -69,11 +68,7 @@ def main(argv: list[str]) -> None:
 
 
 def _swept(text: str, config: Any) -> tuple[str, dict[int | float, Any]]:
-    """Reads FIELD:VALUE,VALUE,...; returns the field, and configs by value.
-
-    Raises:
-      UsageError: names all faults, those of the swept configs too.
-    """
+    """Reads FIELD:VALUE,VALUE,...; returns the field, and checked configs by value."""
     from flax.traverse_util import flatten_dict
 
     from jaxil.training import assembly
@@ -101,7 +96,7 @@ def _swept(text: str, config: Any) -> tuple[str, dict[int | float, Any]]:
 
 
 def _flag_problems(values: flags.FlagValues) -> list[str]:
-    """Returns a sentence for each flag that would otherwise fail only after minutes."""
+    """Returns faults that would otherwise show only after minutes."""
     faults = []
     if values.sweep is not None and values.compare is not None:
         faults.append("--sweep and --compare cannot be combined; leave one out")
@@ -113,7 +108,7 @@ def _flag_problems(values: flags.FlagValues) -> list[str]:
 
 
 def _unwritable(path: str) -> str:
-    return f"--json={path} cannot be written; name a file in a folder of yours"
+    return f"--json={path} cannot be written; choose a file in a writable folder"
 
 
 def _define(values: flags.FlagValues) -> None:

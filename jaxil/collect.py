@@ -3,15 +3,14 @@ r"""Records, shows and converts demonstrations.
     python -m jaxil.collect --workdirs=runs/expert0,runs/expert1 \
         --output=cartpole_swingup.npz --num_episodes=50
 
-evaluates the policies of one or several runs by their mean actions; the best one plays
-the episodes. The file holds simulator states, not pixels: whoever trains renders them
-as their agent sees.
+evaluates the mean actions of the runs' policies and records the best. The file holds
+simulator states, from which each training renders pixels for its agent.
 
     python -m jaxil.collect --inspect=FILE
     python -m jaxil.collect --convert=IN --output=OUT.npz
 
-print what a file of any format holds, with a contact sheet and a video, and write it as
-jaxil's own file of pixels. Formats: jaxil states or pixels, ROT or PatchAIL pickles,
+summarise a file of any format, with a contact sheet and a video, and convert it to
+jaxil's format of pixels. Formats: jaxil states or pixels, ROT or PatchAIL pickles,
 folders of DrQ-v2 or V-D4RL episodes, videos, Minari and LeRobot v3 datasets.
 """
 
@@ -28,10 +27,8 @@ from jaxil import command
 from jaxil.errors import UsageError
 
 _NUM_EVAL_EPISODES = 10
-# The recording environment's seed: shared by no training and no evaluation.
-_SEED = 777
-# Height and width of images rendered from states, unless --image_size is given.
-_INSPECTED_SIZE, _CONVERTED_SIZE = 160, 84
+_SEED = 777  # of the recording environment; no training or evaluation uses it
+_INSPECTED_SIZE, _CONVERTED_SIZE = 160, 84  # of images rendered from states
 _JOBS = ("workdirs", "inspect", "convert")
 
 
@@ -43,7 +40,7 @@ def main(argv: list[str]) -> None:
     if len(jobs) != 1:
         names = ", ".join(f"--{name}" for name in _JOBS)
         given = ", ".join(f"--{name}" for name in jobs) or "none"
-        faults.append(f"exactly one of {names} is needed, and given: {given}")
+        faults.append(f"exactly one of {names} is required; given: {given}")
     faults += _output_faults(values)
     if faults:
         raise UsageError(faults)
@@ -54,7 +51,6 @@ def main(argv: list[str]) -> None:
 
 
 def _record(values: flags.FlagValues) -> None:
-    """Records the best of several policies."""
     import numpy as np
 
     from jaxil.demonstrations import playing, states
@@ -65,8 +61,8 @@ def _record(values: flags.FlagValues) -> None:
     tasks = sorted({run.config.task for run in runs})
     if len(tasks) > 1:
         raise UsageError(
-            f"--workdirs hold runs of different tasks ({', '.join(tasks)}); give the "
-            "seeds of one task"
+            f"--workdirs hold runs of different tasks ({', '.join(tasks)}); list runs "
+            "of one task"
         )
     means = []
     print(f"{'mean':>8}{'std':>8}{'frames':>10}{'minutes':>9}  run")
@@ -109,9 +105,10 @@ def _record(values: flags.FlagValues) -> None:
 
 
 def _inspect(values: flags.FlagValues) -> None:
-    """Prints a table; writes a contact sheet and a video."""
     from jaxil.demonstrations import inspection
     from jaxil.files.video import write_video
+    from jaxil.files.writing import replacing
+    from jaxil.machine import memory
 
     path = pathlib.Path(values.inspect)
     with _reported(path, f"--inspect={path}"):
@@ -119,28 +116,26 @@ def _inspect(values: flags.FlagValues) -> None:
             path,
             image_size=values.image_size or _INSPECTED_SIZE,
             render_quality=values.render_quality,
-            max_bytes=_max_bytes(),
+            max_bytes=memory.spare_bytes(),
         )
     name = path.resolve().stem
-    # Never the name of the input, which may be a video in this very folder.
+    # Never the input itself, which may be a video in this folder.
     folder = pathlib.Path(values.output or ".")
     sheet, video = folder / f"{name}_sheet.png", folder / f"{name}_episode0.mp4"
     try:
-        temporary = sheet.with_suffix(".part")
-        inspection.contact_sheet(seen).save(temporary, format="png")
-        temporary.replace(sheet)
+        with replacing(sheet) as temporary:
+            inspection.contact_sheet(seen).save(temporary, format="png")
         write_video(video, seen.video, fps=seen.frames_per_second, labels=(name, ""))
     except OSError as error:
         raise UsageError(f"--output={folder}: {error}") from error
-    # Last, so that `| head` cuts nothing short.
-    print(inspection.table(seen))
+    print(inspection.table(seen))  # last, because `| head` may end the process
     print(f"contact sheet: {sheet}\nvideo of episode 0: {video}")
 
 
 def _convert(values: flags.FlagValues) -> None:
-    """Writes a file of any format as jaxil's own file of pixels."""
     from jaxil.demonstrations import foreign, inspection, states
     from jaxil.demonstrations.readers import own
+    from jaxil.machine import memory
 
     path, output = pathlib.Path(values.convert), pathlib.Path(values.output)
     with _reported(path, f"--convert={path} --output={output}"):
@@ -153,7 +148,7 @@ def _convert(values: flags.FlagValues) -> None:
         else:
             recording = foreign.open_recording(
                 path,
-                max_bytes=_max_bytes(),
+                max_bytes=memory.spare_bytes(),
                 frame_skip=values.frame_skip,
                 image_size=values.image_size,
             )
@@ -166,7 +161,7 @@ def _convert(values: flags.FlagValues) -> None:
 
 @contextlib.contextmanager
 def _reported(path: pathlib.Path, flags_given: str) -> Iterator[None]:
-    """Turns what may be wrong with a user's file into one message."""
+    """Turns errors of a user's file into a UsageError."""
     from jaxil.demonstrations.states import DemonstrationError
 
     try:
@@ -182,16 +177,13 @@ def _reported(path: pathlib.Path, flags_given: str) -> Iterator[None]:
 
 
 def _output_faults(values: flags.FlagValues) -> list[str]:
-    """Returns why the output cannot be written, before minutes of work are lost."""
+    """Checks the output before minutes of work are lost."""
     if values.output is None:
-        if values.inspect:
-            return []
-        return ["--output is missing: name the file to write, NAME.npz"]
+        return [] if values.inspect else ["--output=NAME.npz is missing"]
     output = pathlib.Path(values.output)
     if values.inspect:
-        if output.is_dir():
-            return []
-        return [f"--output={output} must be a folder that exists"]
+        exists = output.is_dir()
+        return [] if exists else [f"--output={output} must be an existing folder"]
     if output.is_dir():
         return [f"--output={output} is a folder: name a file, NAME.npz"]
     if values.convert and output.resolve() == pathlib.Path(values.convert).resolve():
@@ -201,14 +193,12 @@ def _output_faults(values: flags.FlagValues) -> list[str]:
         with tempfile.TemporaryFile(dir=folder):
             return []
     except OSError as error:
-        return [
-            f"--output={output} cannot be written ({error.strerror or error}): name "
-            "a file in another folder"
-        ]
+        reason = error.strerror or error
+        return [f"--output={output} cannot be written ({reason}): name another file"]
 
 
 def _named_output(argv: list[str]) -> list[str]:
-    """Lets people write `--convert IN OUT` for `--convert=IN --output=OUT`."""
+    """Rewrites `--convert IN OUT` as `--convert=IN --output=OUT`."""
     if "--convert" not in argv:
         return argv
     index = argv.index("--convert")
@@ -219,39 +209,21 @@ def _named_output(argv: list[str]) -> list[str]:
     return [*argv[:index], *named, *argv[index + 3 :]]
 
 
-def _max_bytes() -> int:
-    """Returns how much memory one array of a file may take."""
-    from jaxil.machine import memory
-
-    return memory.spare_bytes()
-
-
 def _define(values: flags.FlagValues) -> None:
     text = functools.partial(flags.DEFINE_string, default=None, flag_values=values)
     number = functools.partial(flags.DEFINE_integer, flag_values=values)
     flags.DEFINE_list(
         "workdirs",
         [],
-        "folders of runs of one task, comma-separated, to record the best of",
+        "comma-separated folders of runs of one task, of which the best is recorded",
         flag_values=values,
     )
-    text("inspect", help="file or folder to show, of any format")
-    text(
-        "convert",
-        help="file or folder of any format to write as pixels; also --convert IN OUT",
-    )
-    text(
-        "output",
-        help="file to write, NAME.npz; with --inspect the folder for sheet and video",
-    )
+    text("inspect", help="file or folder of any format to summarise")
+    text("convert", help="file or folder to convert to pixels; also --convert IN OUT")
+    text("output", help="NAME.npz; for --inspect a folder for contact sheet and video")
     number("num_episodes", 50, "episodes to record", 1, 10_000)
-    number(
-        "image_size",
-        None,
-        "height and width for --convert and --inspect; without it pixels keep theirs",
-        8,
-        1024,
-    )
+    image_size = "height and width for --convert and --inspect; pixels keep theirs"
+    number("image_size", None, image_size, 8, 1024)
     flags.DEFINE_enum(
         "render_quality",
         "paper",

@@ -8,7 +8,7 @@ import importlib.machinery
 import importlib.util
 import pathlib
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import ml_collections
@@ -49,7 +49,7 @@ def parse(argv: list[str], description: str, define: Define) -> flags.FlagValues
         raise SystemExit(0)
     faults: list[Fault | str] = []
     config_words = []
-    for word in _joined(argv[1:], values):
+    for word in joined(argv[1:], values):
         name = _name(word)
         if not word.startswith("-"):
             faults.append(Fault(repr(word), "is not a flag", "flags start with --"))
@@ -123,9 +123,10 @@ def _name(word: str) -> str:
     return word.lstrip("-").partition("=")[0]
 
 
-def _joined(words: list[str], values: flags.FlagValues) -> list[str]:
-    """Joins "--name value" to "--name=value"."""
-    joined: list[str] = []
+def joined(words: Sequence[str], values: flags.FlagValues | None = None) -> list[str]:
+    """Joins "--name value" to "--name=value", for these flags and config fields."""
+    values = values or flags.FlagValues()
+    whole: list[str] = []
     rest = list(words)
     while rest:
         word = rest.pop(0)
@@ -133,9 +134,10 @@ def _joined(words: list[str], values: flags.FlagValues) -> list[str]:
         is_switch = name in values and values[name].boolean
         takes_value = name in values or name.startswith(f"{_CONFIG}.")
         if word.startswith("-") and "=" not in word and takes_value and not is_switch:
-            word = f"{word}={rest.pop(0)}" if rest else word
-        joined.append(word)
-    return joined
+            has_value = rest and not rest[0].startswith("--")
+            word = f"{word}={rest.pop(0)}" if has_value else word
+        whole.append(word)
+    return whole
 
 
 def _help(values: flags.FlagValues) -> str:

@@ -1,11 +1,11 @@
-r"""Examines this machine: what works, what does not, and what to do about it.
+r"""Checks whether this machine is ready for a run, and says what to do if not.
 
     python -m jaxil.doctor [--config=configs/pdac.py:walker_walk] [--config.FIELD=V]
 
-Prints one line for each check: ok, warning or fault; what was examined; what was found;
-what to do. Without --config the paper's settings are examined.
+Prints one line per check: ok, warning or fault; what was checked; the result; advice.
+Without --config it checks for the paper's settings.
 
-Exit status: 0 no faults; 1 a fault; 2 wrong use.
+Exit status: 0 no faults; 1 a fault; 2 invalid arguments.
 """
 
 import contextlib
@@ -27,14 +27,14 @@ from jaxil.machine import memory as host_memory
 _GL_INSTALL = f"apt-get install {' '.join(startup.GL_PACKAGES)}"
 _SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "software")
 _JAXLIB = "jaxlib>=0.10,<0.13"  # installed by jax
-_NUM_FRAMES = 50  # timed at each quality
+_NUM_FRAMES = 50  # timed per quality
 _SLOW_FRAME_MS = 8.0
 _HOST_MARGIN_BYTES = 1.5e9  # jax, the learner, the simulators
-_DEVICE_MARGIN_BYTES = 3e9  # the learner and temporaries of an update of 256 images
+_DEVICE_MARGIN_BYTES = 3e9  # the learner, and temporaries of a batch of 256 images
 
 
 class Finding(NamedTuple):
-    """The outcome of one check."""
+    """The result of one check."""
 
     level: str  # "ok", "warning" or "fault"
     what: str
@@ -47,13 +47,13 @@ class Finding(NamedTuple):
 
 
 def examine(config: Any) -> Iterator[Finding]:
-    """Runs all checks for a run of `config`; without one, those that need none."""
+    """Runs all checks for a run of `config`; if None, those that do not need it."""
     checks = [versions, gl_libraries, jax_devices, convolutions]
     checks += [rendering, memory, demonstrations] if config else []
     for check in checks:
         try:
             yield from check(config)
-        # A broken package may raise anything, and must not hide the other findings.
+        # A broken package may raise anything, but must not hide the other findings.
         except Exception as error:
             where = traceback.extract_tb(error.__traceback__)[-1]
             place = f"{pathlib.Path(where.filename).name}, line {where.lineno}"
@@ -63,7 +63,7 @@ def examine(config: Any) -> Iterator[Finding]:
 
 
 def versions(_: Any) -> Iterator[Finding]:
-    """Compares installed packages with the versions that this one was tested with."""
+    """Compares the versions of packages with those that jaxil requires."""
     good = []
     for text in (*(importlib.metadata.requires("jaxil") or ()), _JAXLIB):
         requirement = Requirement(text)
@@ -79,7 +79,7 @@ def versions(_: Any) -> Iterator[Finding]:
 
 
 def gl_libraries(_: Any) -> Iterator[Finding]:
-    """Looks for the libraries that render without a screen."""
+    """Looks for the libraries that render without a display."""
     found = {name: ctypes.util.find_library(name) for name in ("EGL", "OSMesa", "GL")}
     value = ", ".join(f"{name} {path or 'missing'}" for name, path in found.items())
     advice = "" if found["EGL"] or found["OSMesa"] else _GL_INSTALL
@@ -87,7 +87,7 @@ def gl_libraries(_: Any) -> Iterator[Finding]:
 
 
 def jax_devices(_: Any) -> Iterator[Finding]:
-    """Asks jax what it computes on."""
+    """Reports the devices that jax uses."""
     found, advice = devices.describe(), ""
     value = f"{found['num_devices']} x {found['device']}, {found['cores']} CPU cores"
     if found["device"].startswith("cpu") and devices.has_cuda_device():
@@ -97,7 +97,7 @@ def jax_devices(_: Any) -> Iterator[Finding]:
 
 
 def convolutions(_: Any) -> Iterator[Finding]:
-    """Compiles the encoder in C, where jax computes on the CPU."""
+    """Compiles the encoder in C, if jax computes on the CPU."""
     from jaxil.native import build
 
     if not devices.device_name().startswith("cpu"):
@@ -109,7 +109,7 @@ def convolutions(_: Any) -> Iterator[Finding]:
 
 
 def rendering(config: Any) -> Iterator[Finding]:
-    """Renders with the chosen backend at each quality, and times it."""
+    """Renders at each quality and times it."""
     from jaxil.environments.camera import RENDER_QUALITIES
 
     backend, size = os.environ.get("MUJOCO_GL", ""), config.image_size
@@ -140,12 +140,12 @@ def rendering(config: Any) -> Iterator[Finding]:
 
 
 def memory(config: Any) -> Iterator[Finding]:
-    """Compares the available memory with what the full replay needs."""
+    """Compares the available memory with the size of the full replay."""
     from jaxil import config as jaxil_config
 
     available = host_memory.available_bytes()
     if available is None:
-        yield Finding("warning", "memory", "cannot be read here", "watch it yourself")
+        yield Finding("warning", "memory", "cannot be determined", "watch it yourself")
         return
     value = f"{available / 1e9:.1f} GB available"
     if config.observation != "pixels":  # state vectors are small
@@ -172,7 +172,7 @@ def memory(config: Any) -> Iterator[Finding]:
 
 
 def demonstrations(config: Any) -> Iterator[Finding]:
-    """Reads the shipped demonstrations and those of `config`."""
+    """Reads the included demonstrations and those of `config`."""
     from jaxil import config as jaxil_config
     from jaxil.demonstrations import states
     from jaxil.training import assembly
@@ -199,19 +199,19 @@ def _render(task: str, image_size: int, quality: str) -> tuple[str, float]:
     )
     with contextlib.closing(environment):
         environment.reset()
-        if environment.frame().std() == 0:  # the first frame also makes the GL context
+        if environment.frame().std() == 0:  # also creates the GL context
             raise RuntimeError("images are blank: try MUJOCO_GL=osmesa")
         seconds = timeit.timeit(environment.frame, number=_NUM_FRAMES) / _NUM_FRAMES
         return environment.renderer.gl_name(), 1e3 * seconds
 
 
 def _judged(what: str, value: str, advice: str, level: str = "warning") -> Finding:
-    """Returns a finding of the given level where there is advice, else "ok"."""
+    """Returns a finding of the given level if there is advice, else "ok"."""
     return Finding(level if advice else "ok", what, value, advice)
 
 
 def _read_config(argv: list[str]) -> Any:
-    """Returns the checked config of the command line; the paper's without --config."""
+    """Returns the checked config; the paper's without --config."""
     from jaxil import command
     from jaxil import config as jaxil_config
     from jaxil.environments import suite

@@ -1,23 +1,23 @@
-"""What a user got wrong, as data: field, value, rule, way out."""
+"""Errors of the user, as data: field, value, rule, way out."""
 
 import dataclasses
 import difflib
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-_SHORT_LIST = 12  # names that a message may list in full
+_SHORT_LIST = 12  # longer lists are cut
 _ABSENT = object()
 
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """One reason why a request is refused.
+    """One reason why a request is invalid.
 
     Attributes:
-      subject: the config field, flag or file that is wrong.
-      rule: what is wrong with it, as the rest of a sentence that begins with it.
+      subject: the config field, flag or file.
+      rule: what is wrong with it, as the rest of a sentence that starts with it.
       way_out: what to do instead; empty if the rule says it.
-      value: what was given; shown unless left out.
+      value: what was given.
     """
 
     subject: str
@@ -38,11 +38,7 @@ class Fault:
 
 
 class UsageError(Exception):
-    """The user asked for something that is not possible.
-
-    Attributes:
-      faults: every reason, at least one.
-    """
+    """The user asked for something that is not possible, for the reasons `faults`."""
 
     def __init__(self, faults: "str | Fault | Iterable[str | Fault]") -> None:
         if isinstance(faults, str | Fault):
@@ -57,7 +53,7 @@ class UsageError(Exception):
 
 
 def unknown_name(subject: str, value: object, known: Sequence[str]) -> Fault:
-    """Returns the fault of a name that does not exist, with the closest that do."""
+    """Returns the fault of an unknown name, with the closest known ones."""
     if len(known) <= _SHORT_LIST:
         return Fault(
             subject, "is unknown", f"choose one of: {', '.join(known)}", value=value

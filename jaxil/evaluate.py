@@ -2,8 +2,8 @@ r"""Evaluates the newest checkpoint of a run: returns, and a video.
 
     python -m jaxil.evaluate --workdir=runs/pdac --num_episodes=50
 
-The policy takes its mean action. Nothing of the run is changed: the video is written
-to WORKDIR/videos/evaluation.mp4, the returns to the screen.
+The policy takes its mean action. The run is not changed; the video is written to
+WORKDIR/videos/evaluation.mp4.
 """
 
 import sys
@@ -12,8 +12,7 @@ from absl import flags
 
 from jaxil import command
 
-# Far from the episodes that training evaluates on.
-_FIRST_EPISODE = 1_000_000
+_FIRST_EPISODE = 1_000_000  # none that training evaluates on
 
 
 def main(argv: list[str]) -> None:

@@ -173,7 +173,7 @@ def _declaration(reference: str) -> Method:
         spec = importlib.util.find_spec(module)
     except (ImportError, ValueError):
         spec = None
-    if spec is None or not spec.origin:
+    if spec is None or not spec.origin or not spec.origin.endswith(".py"):
         raise UsageError(
             Fault(
                 "method",
@@ -182,15 +182,19 @@ def _declaration(reference: str) -> Method:
                 value=reference,
             )
         )
-    expression = _assignment(pathlib.Path(spec.origin), name or "METHOD")
     method: Any = None
     try:
+        expression = _assignment(pathlib.Path(spec.origin), name or "METHOD")
         if expression is not None:
             here = sys.modules[__name__]
             code = compile(ast.Expression(expression), spec.origin, "eval")
             method = eval(code, {"methods": here})
     except NameError:  # it uses names of its own file
         pass
+    except Exception as error:  # whatever is wrong with the file
+        raise UsageError(
+            Fault("method", f"cannot be loaded: {error}", value=reference)
+        ) from error
     if method is None:
         method = getattr(importlib.import_module(module), name or "METHOD", None)
     if not isinstance(method, Method):

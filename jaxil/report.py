@@ -3,9 +3,9 @@ r"""Turns folders of runs into one page with figures, tables and videos.
     python -m jaxil.report RUNS... --output=report
 
 RUNS are folders; every folder with a config.json in or below them is a run, finished or
-not. Writes report/index.html, which opens without a network, report/figures (PNG and
-SVG) and report/tables (CSV). Seeds are averaged with 90 % confidence intervals; runs
-that differ in other settings are kept apart. An older report there is replaced.
+not. Writes report/index.html, which needs no network, report/figures (PNG and SVG) and
+report/tables (CSV). Seeds are averaged with 90 % confidence intervals; runs with other
+settings are kept apart. An older report there is replaced.
 """
 
 import pathlib
@@ -32,7 +32,7 @@ def main(argv: list[str]) -> None:
     if not roots:
         faults.append("name the folders of runs: python -m jaxil.report RUNS...")
     if not values.output:
-        faults.append("--output is empty: name a folder to be made")
+        faults.append("--output is empty: name a new folder")
     else:
         faults += folder.problems(output)
     if faults:
@@ -45,15 +45,17 @@ def main(argv: list[str]) -> None:
         try:
             found.append(runs.read(place))
         except runs.UnreadableError as error:
-            unreadable.append(f"{place / 'config.json'} {error}; skipped")
+            unreadable.append(
+                f"{runs.printable(place / 'config.json')} {error}; skipped"
+            )
     if not found:
         names = ", ".join(map(str, roots))
-        rule = f"no run can be read in or below {names}: a run is a folder that "
-        rule += "`python -m jaxil.launch` has written, with a config.json"
+        rule = f"no run can be read in or below {names}: a run is a folder written by "
+        rule += "`python -m jaxil.launch`, with a config.json"
         raise UsageError([*unreadable, rule])
     for sentence in unreadable:
         print(sentence, file=sys.stderr)
-    print(f"{len(found)} runs; drawing", file=sys.stderr, flush=True)
+    print(f"{len(found)} runs; plotting", file=sys.stderr, flush=True)
     try:
         assembly.write_report(
             found,
@@ -64,7 +66,7 @@ def main(argv: list[str]) -> None:
         )
     except OSError as error:
         raise UsageError(
-            f"--output={str(output)!r} can't be written ({error.strerror or error}); "
+            f"--output={str(output)!r} cannot be written ({error.strerror or error}); "
             "name a folder of yours on a disk with room"
         ) from error
     size = (output / "index.html").stat().st_size / 1e6
@@ -72,7 +74,7 @@ def main(argv: list[str]) -> None:
 
 
 def _named_runs(argv: list[str]) -> list[str]:
-    """Turns the words that are no flags into --runs=WORD, for the parser."""
+    """Turns the words that are not flags into --runs=WORD, for the parser."""
     named, takes_value = argv[:1], False
     for word in argv[1:]:
         if word.startswith("-"):
@@ -94,13 +96,13 @@ def _define(values: flags.FlagValues) -> None:
     flags.DEFINE_string(
         "output",
         "report",
-        "folder to make; an older report there is replaced",
+        "new folder; an older report there is replaced",
         flag_values=values,
     )
     flags.DEFINE_integer(
         "seeds",
-        10,
-        "how many seeds each variant should have; fewer are said to be missing",
+        None,
+        "how many seeds each variant should have; missing ones are listed",
         lower_bound=1,
         upper_bound=_MAX_SEEDS,
         flag_values=values,

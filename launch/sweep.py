@@ -1,23 +1,22 @@
-r"""Makes many runs: tasks x variants x seeds, on this machine or a Slurm cluster.
+r"""Trains many runs: tasks x variants x seeds, on this machine or a Slurm cluster.
 
     python launch/sweep.py --methods=pdac,psil --tasks=walker_walk --workdir=runs/main
     python launch/sweep.py --ablation=figure7 --seeds=5 --workdir=runs/main \
         --cluster=slurm --partition=gpu
     python launch/sweep.py --methods=drqv2 --preset=tiny --workdir=runs/tiny --watch
 
-Each run is an ordinary `python -m jaxil.launch` in DIR/TASK/VARIANT/seedN, and the
-folders are all that a sweep remembers: the same command again does what is missing,
-cut off or failed, and nothing twice. --config.FIELD=VALUE changes a field in all runs.
-Ctrl-C stops all runs of this machine, saved. Exit status 1: some run has failed.
+Each run is an ordinary `python -m jaxil.launch` in DIR/TASK/VARIANT/seedN. Rerun the
+same command to do what is missing, cut off or failed; nothing is done twice.
+--config.FIELD=VALUE changes a field in all runs that have it. Ctrl-C stops the runs of
+this machine, saved. Exit status 1: a run has failed, is damaged or is unfinished.
 """
 
-import contextlib
 import os
 import pathlib
 import shlex
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 # The project's root in place of this folder, as for `python -m`.
@@ -26,18 +25,25 @@ sys.path[0] = str(pathlib.Path(__file__).resolve().parent.parent)
 from absl import flags  # noqa: E402
 
 from jaxil import command  # noqa: E402
-from jaxil.errors import UsageError  # noqa: E402
+from jaxil.errors import Fault, UsageError  # noqa: E402
 from jaxil.machine import startup  # noqa: E402
 from jaxil.reporting import figures  # noqa: E402
-from launch.sweeps import clusters, cost, faults, plan, slurm, state, tables  # noqa: E402
-from launch.sweeps.state import State, Status  # noqa: E402
+from jaxil.training import workdir  # noqa: E402
+from launch.sweeps import clusters, plan, state, tables  # noqa: E402
+from launch.sweeps.state import Run, State, Status  # noqa: E402
+
+Statuses = dict[Run, Status]
+
+# What Slurm has in its queue, and what someone does already, needs no other job.
+_AWAY = (State.FINISHED, State.QUEUED, State.RUNNING)
 
 
 def main(argv: list[str]) -> int:
     """Runs the command; returns its exit status."""
-    overrides = [word for word in argv if word.startswith("--config.")]
-    rest = [word for word in argv if word not in overrides]
-    values = command.parse(rest, __doc__ or "", _define)
+    words = command.joined(argv[1:])
+    overrides = [word for word in words if word.lstrip("-").startswith("config.")]
+    rest = [word for word in words if word not in overrides]
+    values = command.parse([argv[0], *rest], __doc__ or "", _define)
     cluster = clusters.Cluster(
         name=values.cluster,
         num_workers=values.workers,
@@ -48,16 +54,26 @@ def main(argv: list[str]) -> int:
     )
     runs = _checked_runs(values, cluster, overrides)
     if values.watch:
-        return _status_of(tables.watch(lambda: _look(runs)))
+        statuses = tables.watch(lambda: _look(runs))
+        tables.print_failures(statuses)
+        bad = (State.FAILED, State.DAMAGED)
+        return int(any(status.state in bad for status in statuses.values()))
     statuses = _look(runs)
-    # What Slurm has in its queue, and what someone does already, needs no other job.
-    away = (State.FINISHED, State.QUEUED, State.RUNNING)
-    todo = [run for run in runs if statuses[run].state not in away]
+    todo = [
+        run
+        for run, status in statuses.items()
+        if status.state not in _AWAY and not state.damage(run)
+    ]
     tables.print_plan(statuses)
-    guess = cost.guessed_speed(values.preset, on_gpu=clusters.uses_gpus(cluster))
     if todo:
-        left = cost.estimate({run: statuses[run] for run in todo}, statuses, guess)
-        print(cost.sentence(left, clusters.num_at_once(cluster, len(todo)), guess))
+        told = tables.estimate(
+            {run: statuses[run] for run in todo},
+            statuses,
+            num_at_once=clusters.num_at_once(cluster, len(todo)),
+            preset=values.preset,
+            on_gpu=cluster.uses_gpus,
+        )
+        print(told)
     else:
         print("Nothing is left to start.")
     if values.dry_run:
@@ -70,113 +86,80 @@ def main(argv: list[str]) -> int:
             clusters.start(cluster, todo, pathlib.Path(values.workdir), lambda: None)
         print(f"{len(todo)} submitted; see them with the same command and --watch")
         return 0
-    return _stay(cluster, runs, statuses, values.workdir)
+    return _stay(cluster, statuses, values.workdir)
 
 
-def _stay(
-    cluster: clusters.Cluster,
-    runs: Sequence[plan.Run],
-    statuses: dict[plan.Run, Status],
-    folder: str,
-) -> int:
+def _stay(cluster: clusters.Cluster, statuses: Statuses, folder: str) -> int:
     """Has the runs done here, telling what happens to them."""
     # Runs that another sweep has may be left unfinished by it.
-    todo = [run for run in runs if statuses[run].state is not State.FINISHED]
+    todo = [run for run, s in statuses.items() if s.state is not State.FINISHED]
     known = {run: status.state for run, status in statuses.items()}
 
     def tell() -> None:
-        open_runs = [run for run in todo if known[run] is not State.FINISHED]
-        for line in tables.changes(
-            known, {run: state.status(run) for run in open_runs}
-        ):
+        left = [run for run in todo if known[run] is not State.FINISHED]
+        for line in tables.changes(known, {run: state.status(run) for run in left}):
             print(line, flush=True)
 
-    interrupted = False
+    was_interrupted = False
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with _ended_like_ctrl_c():
-            if todo:
-                clusters.start(cluster, todo, pathlib.Path(folder), tell)
+        if todo:
+            clusters.start(cluster, todo, pathlib.Path(folder), tell)
     except KeyboardInterrupt:
-        interrupted = True
+        was_interrupted = True
     tell()
-    statuses = _look(runs)
+    statuses = _look(list(statuses))
     print(f"\n{tables.summary(statuses)}")
-    if interrupted:
-        print("stopped; the same command goes on", file=sys.stderr)
+    if was_interrupted:
+        print("stopped; rerun the same command to resume", file=sys.stderr)
         return 130
     tables.print_failures(statuses)
-    unfinished = [s for s in statuses.values() if s.state is not State.FINISHED]
-    if unfinished and not any(s.state is State.FAILED for s in unfinished):
-        print(f"not all is finished: what workers said is in {folder}/.sweep")
-    return 1 if unfinished else 0
+    return int(any(s.state is not State.FINISHED for s in statuses.values()))
 
 
-def _status_of(statuses: Any) -> int:
-    tables.print_failures(statuses)
-    return int(any(s.state is State.FAILED for s in statuses.values()))
-
-
-def _look(runs: Sequence[plan.Run]) -> dict[plan.Run, Status]:
-    queued = slurm.queued_jobs(runs)
+def _look(runs: Sequence[Run]) -> Statuses:
+    queued = clusters.queued_jobs(runs)
     return {run: state.status(run, queued) for run in runs}
 
 
 def _checked_runs(
     values: flags.FlagValues, cluster: clusters.Cluster, overrides: list[str]
-) -> list[plan.Run]:
+) -> list[Run]:
     starts = not (values.dry_run or values.watch)
-    sentences = list(clusters.problems(cluster, starts=starts))
-    if values.workdir is None:
-        sentences.append("--workdir is missing: name a folder for all runs")
+    faults: list[Fault | str] = [*clusters.problems(cluster, starts=starts)]
+    try:
+        folder = workdir.from_flag(values.workdir)
+    except UsageError as error:
+        faults += error.faults
+        folder = pathlib.Path()
+    pairs = [
+        word.lstrip("-").removeprefix("config.").split("=", 1) for word in overrides
+    ]
     request = plan.Request(
         methods=values.methods,
         ablations=values.ablation,
         tasks=list(dict.fromkeys(values.tasks)),
         num_seeds=values.seeds,
         preset=values.preset,
-        folder=pathlib.Path(values.workdir or "."),
-        overrides=overrides,
+        folder=folder,
+        overrides={field: "".join(text) for field, *text in pairs},
     )
+    # What jax needs is not for the runs: they may be on another machine.
+    environment = dict(os.environ)
+    startup.prepare()
     runs = []
-    with _checking_environment():
+    try:
         from jaxil.training import assembly
 
-        try:
-            runs = plan.make_runs(request, assembly.problems)
-        except faults.Faulty as error:
-            sentences += error.sentences
-    if sentences:
-        raise UsageError(sentences)
-    return runs
-
-
-@contextlib.contextmanager
-def _checking_environment() -> Iterator[None]:
-    """Prepares this process for jax, and takes back what that has set.
-
-    A run finds out for itself: it may be made on another machine.
-    """
-    before = dict(os.environ)
-    startup.prepare()
-    try:
-        yield
+        runs = plan.make_runs(request, assembly.problems)
+    except UsageError as error:
+        faults += error.faults
     finally:
         os.environ.clear()
-        os.environ.update(before)
-
-
-@contextlib.contextmanager
-def _ended_like_ctrl_c() -> Iterator[None]:
-    """Makes SIGTERM stop the sweep as Ctrl-C does."""
-
-    def stop(number: int, frame: Any) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+        os.environ.update(environment)
+    if faults:
+        raise UsageError(faults)
+    return runs
 
 
 def _define(values: flags.FlagValues) -> None:
@@ -185,13 +168,14 @@ def _define(values: flags.FlagValues) -> None:
 
     text, number, yes = flags.DEFINE_string, flags.DEFINE_integer, flags.DEFINE_boolean
     figure_names = ", ".join(f"figure{n}" for n in figures.FIGURES)
-    define(flags.DEFINE_list, "methods", [], "methods, comma separated")
+    methods = "methods, or package.module:METHOD; comma separated"
+    define(flags.DEFINE_list, "methods", [], methods)
     define(flags.DEFINE_list, "ablation", [], f"variants of {figure_names}")
     define(flags.DEFINE_list, "tasks", list(figures.TASKS), "tasks, comma separated")
     define(number, "seeds", 10, "number of seeds")
     define(text, "preset", "paper", "paper, or tiny for CPU cores")
     define(text, "workdir", None, "folder of all runs; made if missing")
-    define(text, "cluster", "local", "local, slurm, or debug: in this process")
+    define(text, "cluster", "local", "local, slurm, or debug: one run, on all cores")
     define(yes, "dry_run", False, "only print the plan and the commands")
     define(yes, "watch", False, "only show how far the runs are; Ctrl-C leaves them be")
     define(number, "workers", None, "local: runs at a time; one per GPU, else per core")

@@ -135,7 +135,7 @@ def test_a_full_replay_is_full(tmp_path):
     config.update(observation="state", hidden_dim=16, batch_size=4, action_repeat=10)
     config.update(replay_size_steps=1000, replay_on_device=True, updates_per_dispatch=2)
     with contextlib.closing(Bench(config, tmp_path, print)) as bench:
-        replay = bench._run.replay
+        replay = bench.run.replay
         assert replay.num_steps_stored == 100
         updates = int(bench.update().num_updates)
         bench.fill_replay()

@@ -144,16 +144,16 @@ def test_pixels_keep_their_size_unless_another_is_asked_for(tmp_path):
     ("flags", "expected"),
     [
         ([], "exactly one of --workdirs, --inspect, --convert"),
-        ([], "--output is missing"),
+        ([], "--output=NAME.npz is missing"),
         (["--inspect=a", "--convert=b", "--output=c"], "given: --inspect, --convert"),
-        (["--convert=a"], "--output is missing"),
+        (["--convert=a"], "--output=NAME.npz is missing"),
         (["--convert=a", "--output=."], "is a folder"),
         (["--convert=a.npz", "--output=./a.npz"], "is the file to convert"),
         (["--workdirs=a", "--output=/proc/x.npz"], "cannot be written"),
         (["--inspect=none.npz"], "none.npz cannot be read"),
-        (["--inspect=setup.cfg"], "in no format that is read"),
-        (["--inspect=setup.cfg", "--output=setup.cfg"], "must be a folder"),
-        (["--convert=setup.cfg", "--output=x.npz"], "in no format that is read"),
+        (["--inspect=setup.cfg"], "in an unsupported format"),
+        (["--inspect=setup.cfg", "--output=setup.cfg"], "must be an existing folder"),
+        (["--convert=setup.cfg", "--output=x.npz"], "in an unsupported format"),
         (["--convert", "a", "b", "c"], "'c' is not a flag"),
         (["--inspect=a", "--image_size=2"], "image_size"),
         (["--inspect=a", "--render_quality=good"], "render_quality"),
@@ -187,13 +187,13 @@ def test_killed_while_writing_leaves_the_old_file_or_the_new_one(few, tmp_path):
     kills = 0
     while process.poll() is None:
         # Begun to write: a temporary file is there.
-        if list(tmp_path.glob("*.part")) and kills < 4:
+        if list(tmp_path.glob(".tmp-*")) and kills < 4:
             time.sleep(0.1 + 0.3 * kills)
             os.kill(process.pid, signal.SIGKILL)
             process.wait()
             kills += 1
             assert output.read_bytes() == few.read_bytes()
-            for part in tmp_path.glob("*.part"):
+            for part in tmp_path.glob(".tmp-*"):
                 part.unlink()
             if kills < 3:
                 process = subprocess.Popen(

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from jaxil.files.tables import read_csv
-from launch.sweeps import slurm, state
+from launch.sweeps import clusters, state
 from launch.sweeps.state import State
 from tests.commands import ROOT, SMALL
 from tests.trainer import FRAMES, stand_in
@@ -83,27 +83,18 @@ PartitionName=debug Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 """
 
 
-def _submit(runs, folder):
-    slurm.submit(
-        runs,
-        logs=folder / ".sweep",
-        folder=ROOT,
-        hours=1.0,
-        partition="",
-        num_gpus=0,
-        num_cpus=1,
-    )
-
-
-@pytest.fixture
-def importable(monkeypatch):
-    """Lets jobs import this project, as `clusters.start` does."""
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+@pytest.fixture(autouse=True)
+def streams(monkeypatch):
     # submitit would close the streams that pytest captures.
     monkeypatch.setenv("SUBMITIT_LOG_LEVEL", "NOCONFIG")
+    monkeypatch.chdir(ROOT)
 
 
-@pytest.mark.usefixtures("importable")
+def _submit(runs, folder):
+    cluster = clusters.Cluster("slurm", hours=1.0, num_gpus=0, num_cpus=1)
+    clusters.submit(cluster, runs, folder / ".sweep")
+
+
 @pytest.mark.parametrize(
     "signals", [["USR2"], ["TERM", "USR2"]], ids=["timeout", "preemption"]
 )
@@ -121,13 +112,12 @@ def test_a_warned_job_saves_is_queued_again_and_goes_on(tmp_path, signals):
     assert done < 42
     # It saved when it was asked to, not only every five episodes.
     assert (run.folder / "checkpoints" / f"frame_{done * FRAMES:012d}").exists()
-    assert job in slurm.queued_jobs([run])
+    assert job in clusters.queued_jobs([run])
     _wait_for_requeued(job, lambda: state.is_finished(run))
     assert f"from episode {done}\n" in (run.folder / "log.txt").read_text()
     _check_rows(run, processes=2)
 
 
-@pytest.mark.usefixtures("importable")
 def test_a_job_that_was_killed_goes_on_from_its_last_checkpoint(tmp_path):
     killed, other = (
         stand_in(tmp_path, name, episodes=30, seconds=0.2) for name in ("one", "two")
@@ -142,7 +132,7 @@ def test_a_job_that_was_killed_goes_on_from_its_last_checkpoint(tmp_path):
     worker = int(pathlib.Path(f"/proc/{trainer}/stat").read_text().split()[3])
     for process in (worker, trainer):
         os.kill(process, signal.SIGKILL)
-    _wait_for(lambda: job not in slurm.queued_jobs([killed]))
+    _wait_for(lambda: job not in clusters.queued_jobs([killed]))
     _output("scontrol", "requeue", job)
     _wait_for_requeued(job, lambda: state.is_finished(killed))
     _wait_for(lambda: state.is_finished(other))
@@ -152,13 +142,12 @@ def test_a_job_that_was_killed_goes_on_from_its_last_checkpoint(tmp_path):
     assert state.failure(killed) is None
 
 
-@pytest.mark.usefixtures("importable")
 def test_a_cancelled_job_saves_and_stays_away(tmp_path):
     run = stand_in(tmp_path, "cancelled", episodes=1000, seconds=0.2)
     _submit([run], tmp_path)
     _wait_for(lambda: _rows(run) >= 2)
     _output("scancel", state.slurm_job(run) or "")
-    _wait_for(lambda: not slurm.queued_jobs([run]))
+    _wait_for(lambda: not clusters.queued_jobs([run]))
     _wait_for(lambda: state.status(run).state is State.PARTLY_DONE)
     done = _rows(run)
     assert (run.folder / "checkpoints" / f"frame_{done * FRAMES:012d}").exists()
@@ -183,8 +172,7 @@ def test_a_sweep_of_real_runs_survives_a_requeue(tmp_path):
     _output("scontrol", "requeue", job)
     watch = [*arguments, "--watch"]
     _wait_for_requeued(job, lambda: "1 finished" in _run(watch), seconds=400)
-    assert "going on from the checkpoint" in (home / "log.txt").read_text()
-    # The episode that was cut off is dropped, so frames are no round numbers.
+    assert "resuming from the checkpoint" in (home / "log.txt").read_text()
     table = read_csv(home / "train.csv")
     assert list(table["episode"]) == list(range(len(table["episode"])))
     assert np.all(np.diff(table["frame"]) >= 1000)

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxil.learner.rewarder import Spec
+from jaxil.learner.rewarder import AgentSpec, Rewarder, Spec
 from jaxil.learner.state import LearnerParams
-from jaxil.maths.types import Episode
+from jaxil.maths.types import Episode, ExpertEpisodes
 from jaxil.networks.agent import AgentNetworks, apply, make_agent_networks
 
 SIDE, ACTION_DIM, FEATURE_DIM = 12, 2, 5
@@ -34,6 +34,11 @@ def make_tiny_networks(**changes) -> AgentNetworks:
 
 
 NETWORKS = make_tiny_networks()
+
+
+def make_agent(frame_stack: int = 1, shift_padding: int = 0) -> AgentSpec:
+    """Returns what methods are told of the agent of `NETWORKS`."""
+    return AgentSpec(NETWORKS, FEATURE_DIM, frame_stack, shift_padding)
 
 
 def make_spec(
@@ -62,7 +67,38 @@ def random_frames(seed: int, *shape: int, low: int = 0, high: int = 256) -> np.n
     return rng.integers(low, high, (*shape, SIDE, SIDE, 3), dtype=np.uint8)
 
 
-def make_episode(frames: np.ndarray) -> Episode:
-    """Returns an episode of T + 1 frames in which nothing was done or earned."""
+def random_actions(seed: int, count: int) -> np.ndarray:
+    """Returns actions in [-1, 1], float32 [count, A]."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-1, 1, (count, ACTION_DIM)).astype(np.float32)
+
+
+def make_episode(frames: np.ndarray, actions: np.ndarray | None = None) -> Episode:
+    """Returns an episode of T + 1 frames that earned nothing."""
     steps = len(frames) - 1
-    return Episode(frames, np.zeros((steps, ACTION_DIM), np.float32), np.zeros(steps))
+    if actions is None:
+        actions = np.zeros((steps, ACTION_DIM), np.float32)
+    return Episode(frames, actions, np.zeros(steps), np.ones(steps))
+
+
+def make_experts(frames: np.ndarray) -> ExpertEpisodes:
+    """Returns demonstrations of one length, whose actions are not known.
+
+    Args:
+      frames: shape [K, N + 1, ...].
+    """
+    count, length = frames.shape[:2]
+    return ExpertEpisodes(frames, np.full(count, length), np.zeros((count, 0, 0)))
+
+
+def make_play(rewarder: Rewarder):
+    """Returns what a run does at an episode's end, compiled once.
+
+    (state, learner, episode, experts) -> (rewards [T], state).
+    """
+
+    def play(state, learner, episode, experts):
+        state = rewarder.observe(state, learner, episode, experts)
+        return rewarder.rewards(state, learner, episode, experts), state
+
+    return jax.jit(play)

@@ -1,6 +1,6 @@
 """Stands in for `jaxil.launch` where only its manners matter, and starts in no time.
 
-It keeps a run's folder as the real one does: lock, tables, checkpoints, going on from
+It keeps a run's folder as the real one does: lock, tables, checkpoints, resuming from
 the newest checkpoint, and saving at the first request to stop.
 """
 
@@ -11,12 +11,12 @@ import signal
 import sys
 import time
 
+from jaxil.config import default_config
 from jaxil.errors import UsageError
 from jaxil.files.tables import CsvLog
 from jaxil.machine.signals import StopOnSignals
 from jaxil.training import workdir
-from launch.sweeps.plan import Run
-from launch.sweeps.worker import HAS_HEARD
+from launch.sweeps.state import Run
 
 FRAMES = 1000  # of an episode
 _EVERY = 5  # episodes from checkpoint to checkpoint
@@ -66,7 +66,7 @@ def _train(flags: argparse.Namespace) -> int:
     if flags.fail:
         print("the reason of the failure", flush=True)
         return 3
-    (flags.folder / "config.json").write_text("{}")
+    workdir.write_config(flags.folder, default_config("zero", "walker_walk"), {})
     checkpoints = flags.folder / "checkpoints"
     saved = [int(path.name[6:]) // FRAMES for path in checkpoints.glob("frame_*")]
     begin = max(saved, default=0)
@@ -78,8 +78,7 @@ def _train(flags: argparse.Namespace) -> int:
 
     def ask(who: str) -> bool:
         asked.append(who)
-        if len(asked) == 1:
-            print(f"{who}: saving; {HAS_HEARD}", flush=True)
+        print(f"{who}: request {len(asked)}", flush=True)
         return len(asked) == 1
 
     with StopOnSignals(ask):

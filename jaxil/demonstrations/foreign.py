@@ -1,4 +1,4 @@
-"""Foreign files of pixels, as episodes of the size that the agent sees."""
+"""Reads files of pixels in any supported format, resized for the agent."""
 
 import itertools
 import pathlib
@@ -19,10 +19,10 @@ from jaxil.demonstrations.readers.recording import (
 from jaxil.demonstrations.readers.sandbox import read_in_child
 from jaxil.files.untrusted import printable, require_regular
 
-# Asked in this order; each decides by content. Videos last: other datasets hold some.
+# The first that recognises a file reads it. Videos last: datasets may contain some.
 _READERS: tuple[Any, ...] = (own, pickles, minari, lerobot, replays, videos)
-# Parsed in Python, which cannot crash, and checked before anything is unpacked.
-_READ_HERE = (own, replays)
+# Safe without a child process: parsed in Python, and checked before unpacking.
+_IN_PROCESS = (own, replays)
 FORMATS = (
     "jaxil states or pixels (.npz), ROT or PatchAIL pickles, folders of DrQ-v2 or "
     "V-D4RL episodes (.npz), videos (mp4, mov, gif, webm, mkv, avi), Minari datasets, "
@@ -31,23 +31,14 @@ FORMATS = (
 
 
 class PixelEpisodes(NamedTuple):
-    """The episodes of a foreign file, made to fit.
+    """K episodes, padded to the longest."""
 
-    Attributes:
-      recording: the file's facts; its episodes are used up.
-      frames: uint8 [K, N + 1, S, S, 3]; a shorter episode repeats its last frame.
-      num_frames: how many of them are the episode's own. Shape [K].
-      actions: float32 [K, N, A], zero after an episode's end; None without.
-      rewards: float32 [K, N], zero after an episode's end; None without.
-      stored_size: height and width in the file, of the first episode.
-    """
-
-    recording: Recording
-    frames: np.ndarray
-    num_frames: np.ndarray
-    actions: np.ndarray | None
-    rewards: np.ndarray | None
-    stored_size: tuple[int, int]
+    recording: Recording  # its episodes are exhausted
+    frames: np.ndarray  # uint8 [K, N + 1, S, S, 3], padded with the last frame
+    num_frames: np.ndarray  # without padding. Shape [K]
+    actions: np.ndarray | None  # float32 [K, N, A], padded with zeros; None if unknown
+    rewards: np.ndarray | None  # float32 [K, N], padded with zeros; None if unknown
+    stored_size: tuple[int, int]  # height and width of the first episode in the file
 
 
 def open_recording(
@@ -58,23 +49,21 @@ def open_recording(
     image_size: int | None = None,
     keep_aspect: bool = False,
 ) -> Recording:
-    """Opens a file or folder of any known format, decided by content.
+    """Opens a file or folder; its content decides the format.
 
     Args:
-      path: what to open.
-      max_bytes: the largest array that may be unpacked.
-      frame_skip: every n-th frame is kept, and the rewards between are summed.
-      image_size: height and width of the frames; None for those in the file. Videos are
-        scaled while they are decoded, so that their size and length need no memory.
-      keep_aspect: of videos, `image_size` is the shorter side and nothing is enlarged;
-        the frames of other formats are left as they are.
+      path: file or folder.
+      max_bytes: limit of each unpacked array.
+      frame_skip: keeps every n-th frame, and sums the rewards in between.
+      image_size: height and width of the frames; None keeps the file's.
+      keep_aspect: only shrinks videos, until their shorter side is `image_size`; other
+        formats keep their size.
 
     Returns:
       The recording, whose episodes are checked as they are read.
 
     Raises:
-      FormatError: no reader knows it, or it breaks its format's rules.
-      OSError: it cannot be opened.
+      FormatError: unknown format, or the file breaks its format's rules.
     """
     try:
         require_regular(path, or_folder=True)
@@ -82,17 +71,15 @@ def open_recording(
         raise FormatError(str(error)) from error
     reader = next((reader for reader in _READERS if reader.recognises(path)), None)
     if reader is None:
-        raise FormatError(
-            f"is cut off, damaged, or in no format that is read: {FORMATS}"
-        )
+        raise FormatError(f"is cut off, damaged or in an unsupported format: {FORMATS}")
     options = ReadOptions(max_bytes, frame_skip, image_size, keep_aspect)
-    if reader in _READ_HERE:
+    if reader in _IN_PROCESS:
         items = checked(reader.read(path, options))
     else:
         items = read_in_child(reader.read, path, options)
     recording = next(items)
     repeat, speed = recording.action_repeat, recording.frames_per_second
-    if reader is videos:  # which skips frames while it decodes them
+    if reader is videos:  # it has skipped frames already
         frame_skip = 1
     return recording._replace(
         episodes=_fitted(items, frame_skip, None if keep_aspect else image_size),
@@ -111,26 +98,20 @@ def read_episodes(
     frame_skip: int,
     max_bytes: int,
 ) -> PixelEpisodes:
-    """Reads the first episodes of a foreign file, resized with antialiasing.
+    """Reads the first episodes, resized with antialiasing.
 
-    Args:
-      path: file or folder.
-      num_episodes: how many.
-      image_size: height and width of the result, in pixels.
-      frame_skip: every n-th frame is kept.
-      max_bytes: the memory that the result, and each array on the way, may take.
+    `max_bytes` limits the result and every intermediate array; for the other arguments
+    see `open_recording`.
 
     Raises:
-      FormatError: see `open_recording`; or it holds fewer episodes, or too much.
-      OSError: it cannot be opened.
+      FormatError: see `open_recording`; or too few episodes, or too many bytes.
     """
     recording = open_recording(
         path, max_bytes=max_bytes, frame_skip=frame_skip, image_size=image_size
     )
     if num_episodes > recording.num_episodes:
         raise FormatError(
-            f"holds {recording.num_episodes} episodes, and "
-            f"num_episodes={num_episodes} were asked for"
+            f"holds {recording.num_episodes} episodes, but num_episodes={num_episodes}"
         )
     episodes, num_bytes = [], 0
     for episode in itertools.islice(recording.episodes, num_episodes):
@@ -139,7 +120,7 @@ def read_episodes(
         if num_bytes > max_bytes:
             raise FormatError(
                 f"needs more than {max_bytes} bytes for {len(episodes)} episodes at "
-                f"{image_size}x{image_size} pixels, which is more than can be spared"
+                f"{image_size}x{image_size} pixels"
             )
     if len(episodes) < num_episodes:
         raise FormatError(f"ends after {len(episodes)} of {num_episodes} episodes")
@@ -147,8 +128,8 @@ def read_episodes(
         recording,
         _padded([episode.frames for episode in episodes], repeat_last=True),
         np.array([len(episode.frames) for episode in episodes]),
-        _together("actions", [episode.actions for episode in episodes]),
-        _together("rewards", [episode.rewards for episode in episodes]),
+        _stacked("actions", [episode.actions for episode in episodes]),
+        _stacked("rewards", [episode.rewards for episode in episodes]),
         episodes[0].stored_size or (image_size, image_size),
     )
 
@@ -156,15 +137,13 @@ def read_episodes(
 def _fitted(
     items: Iterator[PixelEpisode | None], frame_skip: int, image_size: int | None
 ) -> Iterator[PixelEpisode]:
-    """Yields a reader's episodes with frames skipped, and the others resized."""
+    """Skips frames and resizes the others."""
     for index, episode in enumerate(item for item in items if item is not None):
         frames, actions, rewards, stored_size = episode
         num_steps = (len(frames) - 1) // frame_skip
         if num_steps < 1:
-            raise FormatError(
-                f"has {len(frames)} frames in episode {index}, too few for "
-                f"frame_skip={frame_skip}"
-            )
+            what = f"has {len(frames)} frames in episode {index}"
+            raise FormatError(f"{what}, too few for frame_skip={frame_skip}")
         used = num_steps * frame_skip
         frames = frames[: used + 1 : frame_skip]
         if actions is not None:
@@ -177,8 +156,8 @@ def _fitted(
         yield PixelEpisode(frames, actions, rewards, (height, width))
 
 
-def _together(name: str, values: list[np.ndarray | None]) -> np.ndarray | None:
-    """Returns what all episodes have as one array; None where one lacks it."""
+def _stacked(name: str, values: list[np.ndarray | None]) -> np.ndarray | None:
+    """Pads with zeros and stacks; None if an episode has none."""
     known = [value for value in values if value is not None]
     if len(known) < len(values):
         return None
@@ -191,8 +170,6 @@ def _together(name: str, values: list[np.ndarray | None]) -> np.ndarray | None:
 def _padded(arrays: list[np.ndarray], *, repeat_last: bool) -> np.ndarray:
     """Stacks arrays [N_k, ...] of different lengths."""
     longest = max(map(len, arrays))
-    if all(len(array) == longest for array in arrays):
-        return np.stack(arrays)
     stacked = np.zeros((len(arrays), longest, *arrays[0].shape[1:]), arrays[0].dtype)
     for row, array in zip(stacked, arrays, strict=True):
         row[: len(array)] = array

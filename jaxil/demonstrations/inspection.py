@@ -1,4 +1,4 @@
-"""Shows a demonstration file as a table, a contact sheet and a video."""
+"""Summarises a demonstration file as a table, a contact sheet and a video."""
 
 import itertools
 import pathlib
@@ -13,69 +13,53 @@ from jaxil.demonstrations.readers.recording import PixelEpisode, Recording
 from jaxil.environments import suite
 from jaxil.files.untrusted import printable
 
-NUM_COLUMNS = 8  # pictures of an episode on the sheet
-_NUM_ROWS = 10  # episodes on the sheet
-_MIN_SIDE = 96  # pixels of a picture on the sheet
+NUM_COLUMNS = 8  # images of an episode on the contact sheet
+_NUM_ROWS = 10  # episodes on the contact sheet
+_MIN_SIDE = 96  # pixels of an image on the contact sheet
 _MARGIN = 4
 _CAPTION = 16
-_DEFAULT_SPEED = 25.0  # frames per second, where a file lacks it
+_DEFAULT_FPS = 25.0
 
 
 class EpisodeSummary(NamedTuple):
-    """One row of the table.
+    """One row of the table."""
 
-    Attributes:
-      num_frames: N + 1.
-      size: of a frame in pixels, "WxH"; "rendered" for states.
-      action_dim: None without actions.
-      task_return: None without rewards.
-    """
-
-    num_frames: int
-    size: str
-    action_dim: int | None
-    task_return: float | None
+    num_frames: int  # N + 1
+    size: str  # of a frame in pixels, "WxH"; "rendered" for states
+    action_dim: int | None  # None without actions
+    task_return: float | None  # None without rewards
 
 
 class Inspection(NamedTuple):
-    """The content of a file.
+    """The content of a file."""
 
-    Attributes:
-      facts: label and text of what the file says of itself.
-      episodes: one summary each.
-      pictures: of up to ten episodes, uint8 [8, H, W, 3] each, evenly spaced in time.
-      video: the first episode, uint8 [N + 1, H, W, 3].
-      frames_per_second: of the video.
-    """
-
-    facts: dict[str, str]
+    facts: dict[str, str]  # metadata as text, by label
     episodes: list[EpisodeSummary]
-    pictures: list[np.ndarray]
-    video: np.ndarray
-    frames_per_second: float
+    pictures: list[np.ndarray]  # spaced frames of ten episodes, uint8 [8, H, W, 3] each
+    video: np.ndarray  # the first episode, uint8 [N + 1, H, W, 3]
+    frames_per_second: float  # of the video
 
 
 def inspect(path: pathlib.Path, *, max_bytes: int, **view: Any) -> Inspection:
-    """Reads a demonstration file, and renders a part of it if it holds states.
+    """Reads a demonstration file of any format; renders samples of simulator states.
 
     Args:
-      path: file or folder of any format in `foreign.FORMATS`.
-      max_bytes: the largest array that may be unpacked.
-      view: `image_size` and `render_quality` of images rendered from states; videos are
-        shrunk until their shorter side has that size.
+      path: file or folder.
+      max_bytes: limit of each unpacked array.
+      view: `image_size` and `render_quality` for states; videos are shrunk until their
+        shorter side is `image_size`.
 
     Raises:
       DemonstrationError: a file of states is damaged.
-      ValueError: its states are not those of its task.
-      FormatError: another file is, or is of no known format.
-      OSError: it cannot be opened.
+      ValueError: the states do not fit their task.
+      FormatError: another file is damaged or has an unknown format.
     """
     if states.recognises(path):
         return _inspect_states(path, view)
     recording = foreign.open_recording(
         path, max_bytes=max_bytes, image_size=view["image_size"], keep_aspect=True
     )
-    speed = recording.frames_per_second
+    fps = recording.frames_per_second
     summaries, pictures, video = [], [], np.empty((0, 1, 1, 3), np.uint8)
     for episode in recording.episodes:
         frames, actions, rewards = episode.frames, episode.actions, episode.rewards
@@ -96,11 +80,11 @@ def inspect(path: pathlib.Path, *, max_bytes: int, **view: Any) -> Inspection:
         "format": recording.kind,
         "task": recording.task or "unknown",
         "action repeat": str(recording.action_repeat or "unknown"),
-        "frames per second": "unknown" if speed is None else f"{speed:g}",
+        "frames per second": "unknown" if fps is None else f"{fps:g}",
     }
     for number, note in enumerate(recording.notes, start=1):
         facts[f"note {number}"] = note
-    return Inspection(facts, summaries, pictures, video, speed or _DEFAULT_SPEED)
+    return Inspection(facts, summaries, pictures, video, fps or _DEFAULT_FPS)
 
 
 def _inspect_states(path: pathlib.Path, view: dict[str, Any]) -> Inspection:
@@ -126,20 +110,14 @@ def _inspect_states(path: pathlib.Path, view: dict[str, Any]) -> Inspection:
             for episode in range(min(num_episodes, _NUM_ROWS))
         ],
         video=_render(stored, 0, slice(None), view),
-        frames_per_second=_speed(stored),
+        frames_per_second=_fps(stored),
     )
 
 
 def render_recording(path: pathlib.Path, **view: Any) -> Recording:
-    """Opens a file of states as if it held the pixels that its task shows.
+    """Opens a file of states as a recording that is rendered while it is read.
 
-    Args:
-      path: the file.
-      view: `image_size` and `render_quality`.
-
-    Raises:
-      DemonstrationError: the file is damaged.
-      ValueError: its states are not those of its task.
+    `view` is `image_size` and `render_quality`. Raises the errors of `inspect`.
     """
     stored = states.read_states(path)
 
@@ -154,12 +132,12 @@ def render_recording(path: pathlib.Path, **view: Any) -> Recording:
         episodes=episodes(),
         task=stored.metadata["task"],
         action_repeat=stored.metadata["action_repeat"],
-        frames_per_second=_speed(stored),
+        frames_per_second=_fps(stored),
     )
 
 
 def table(inspection: Inspection) -> str:
-    """Returns the inspection as text, with one line for each episode."""
+    """Formats the inspection as text, with one line per episode."""
     lines = [f"{name}: {printable(text)}" for name, text in inspection.facts.items()]
     lines.append(f"episodes: {len(inspection.episodes)}")
     known = [row.task_return for row in inspection.episodes]
@@ -181,7 +159,7 @@ def table(inspection: Inspection) -> str:
 
 
 def contact_sheet(inspection: Inspection) -> Image.Image:
-    """Returns one row of pictures for each episode, time running to the right."""
+    """Returns one row of images per episode, in order of time."""
     height, width = inspection.pictures[0].shape[1:3]
     scale = _MIN_SIDE / min(height, width)
     cell = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -206,11 +184,11 @@ def contact_sheet(inspection: Inspection) -> Image.Image:
 
 
 def spaced(num_frames: int) -> np.ndarray:
-    """Returns the indices of 8 evenly spaced frames, the first and last among them."""
+    """Returns the indices of 8 evenly spaced frames, including first and last."""
     return np.linspace(0, num_frames - 1, NUM_COLUMNS).round().astype(int)
 
 
-def _speed(stored: states.StateDemonstrations) -> float:
+def _fps(stored: states.StateDemonstrations) -> float:
     metadata = stored.metadata
     return 1.0 / suite.decision_seconds(metadata["task"], metadata["action_repeat"])
 
@@ -221,7 +199,7 @@ def _render(
     times: np.ndarray | slice,
     view: dict[str, Any],
 ) -> np.ndarray:
-    """Returns images [N, S, S, 3] of some moments of an episode."""
+    """Renders an episode at some times: [N, S, S, 3]."""
     return rendering.observe_episodes(
         stored.simulator_states(times, slice(episode, episode + 1)),
         task=stored.metadata["task"],

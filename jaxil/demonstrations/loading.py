@@ -1,4 +1,4 @@
-"""Demonstrations as the agent would see them, from files of any format."""
+"""Loads demonstrations of any format as the agent observes them, and samples them."""
 
 import functools
 import os
@@ -12,27 +12,26 @@ from jaxil.demonstrations import foreign, mismatch, rendering, states
 from jaxil.demonstrations.readers.recording import FormatError
 from jaxil.demonstrations.states import StateDemonstrations, fault, unreadable
 from jaxil.environments import suite
+from jaxil.files import archive
 from jaxil.maths.types import ExpertBatch
 from jaxil.replay.stacking import gather_stacks
 
 _WAY_OUT = (
-    "Repair or replace it; `python -m jaxil.collect --inspect=FILE` shows what a file "
-    "holds"
+    "Replace it; `python -m jaxil.collect --inspect=FILE` shows what a file holds"
 )
 
 
 class Demonstrations(NamedTuple):
-    """Expert episodes as the agent would see them.
+    """K expert episodes, frames not stacked, padded to the longest.
 
     Attributes:
-      frames: single images, uint8 [K, N + 1, H, W, 3], or, where the agent observes
-        states, float32 [K, N + 1, S]. A shorter episode repeats its last frame.
-      num_frames: how many of them are the episode's own. Shape [K].
-      actions: float32 [K, N, A]; None where the file has none. Only for methods that
-        may see them.
-      task_rewards: float32 [K, N]; None where the file has none. Only for logs.
-      metadata: the file's, with `file`, `action_repeat`, and `returns` as served: one
-        number for each episode, or none at all.
+      frames: uint8 [K, N + 1, H, W, 3], or float32 [K, N + 1, S] of observed states;
+        padded with the last frame.
+      num_frames: without padding. Shape [K].
+      actions: float32 [K, N, A]; None if unknown.
+      task_rewards: float32 [K, N]; None if unknown. Only for logs.
+      metadata: the file's, with `file`, the agent's `action_repeat`, and `returns` at
+        that action repeat: one per episode, or an empty list if unknown.
     """
 
     frames: np.ndarray
@@ -42,7 +41,7 @@ class Demonstrations(NamedTuple):
     metadata: dict[str, Any]
 
     def mean_return(self) -> float | None:
-        """Returns the mean task return; None where rewards are not known."""
+        """Returns the mean task return; None if rewards are unknown."""
         returns = self.metadata["returns"]
         return float(np.mean(returns)) if returns else None
 
@@ -56,17 +55,13 @@ def check(
     image_size: int = 84,
     observation: str = "pixels",
     frame_skip: int = 1,
-    max_bytes: int = states.MAX_ARRAY_BYTES,
+    max_bytes: int = archive.MAX_BYTES,
     sees_actions: bool = False,
 ) -> None:
-    """Finds out whether `load` would succeed, without rendering anything.
+    """Raises what `load` would raise, without rendering anything.
 
-    Args:
-      source: see `load`, as all others.
-      sees_actions: whether the method needs the expert's actions.
-
-    Raises:
-      DemonstrationError: as `load`.
+    `sees_actions` tells whether the method needs the expert's actions; for the other
+    arguments see `load`.
     """
     path = _path_of(source, task)
     if states.recognises(path):
@@ -78,17 +73,12 @@ def check(
     if not sees_actions:
         return
     if loaded.actions is None:
-        raise fault(
-            path, "holds no actions, which this method sees", "Choose another method"
-        )
+        raise fault(path, "holds no actions", "Use a method that needs none")
     needed = _model_sizes(task)["actions"]
     if loaded.actions.shape[2] != needed:
-        raise fault(
-            path,
-            f"has actions of {loaded.actions.shape[2]} numbers, where {task} needs "
-            f"{needed}",
-            "Choose a method that sees no actions",
-        )
+        what = f"has actions of {loaded.actions.shape[2]} numbers"
+        way_out = "Use a method that needs no actions"
+        raise fault(path, f"{what}, but {task} needs {needed}", way_out)
 
 
 def load(
@@ -101,30 +91,27 @@ def load(
     render_quality: str,
     observation: str = "pixels",
     frame_skip: int = 1,
-    max_bytes: int = states.MAX_ARRAY_BYTES,
+    max_bytes: int = archive.MAX_BYTES,
     cache: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Demonstrations:
     """Loads demonstrations; states are rendered by the agent's own environment.
 
+    Arguments not listed are those of `suite.make_environment`.
+
     Args:
-      source: a file or folder of any format in `foreign.FORMATS`; "" for the states
-        that are shipped for the task.
-      task: `domain_task`.
-      num_episodes: how many, the file's first ones.
-      action_repeat: the agent's; a multiple of a state file's. Where several stored
-        steps become one, their rewards are summed and the first action is kept.
-      image_size: height and width in pixels.
-      render_quality: "paper", "fast" or "smooth".
-      observation: "pixels" or "state".
-      frame_skip: for files of pixels: every so many-th frame is kept.
-      max_bytes: for files of pixels: the memory that they may take.
-      cache: whether to keep rendered images, in `machine.cache.cache_folder()`.
-      progress: called with (images rendered, images in all) if any have to be.
+      source: a file or folder of any format in `foreign.FORMATS`; "" for the task's
+        shipped states.
+      num_episodes: loads the file's first ones.
+      action_repeat: the agent's; a multiple of the one in a file of states. Rewards of
+        merged steps are summed, and the first action is kept.
+      frame_skip: keeps every n-th frame of a file of pixels.
+      max_bytes: memory limit for a file of pixels.
+      cache: whether to cache rendered images.
+      progress: called with (images done, all images) while rendering.
 
     Raises:
-      DemonstrationError: the file cannot be read, is not one of demonstrations, is
-        damaged, or is not what was asked for.
+      DemonstrationError: the file cannot be read, is damaged, or does not fit.
     """
     path = _path_of(source, task)
     if not states.recognises(path):
@@ -157,7 +144,7 @@ def load(
             progress=progress,
         )
     except ValueError as error:
-        raise fault(path, f"cannot be shown ({error})") from error
+        raise fault(path, f"cannot be rendered ({error})") from error
     rewards = stored.rewards[:, :used].reshape(num_episodes, num_steps, stride).sum(2)
     served = {"file": str(path), "action_repeat": action_repeat}
     return Demonstrations(
@@ -177,19 +164,18 @@ def sample(
     frame_stack: int,
     successors: bool = False,
 ) -> ExpertBatch:
-    """Samples expert observations with the actions taken there, uniformly.
+    """Samples observations and their actions uniformly from all steps.
 
     Args:
-      demonstrations: whole episodes of single frames.
-      rng: source of the draw.
+      demonstrations: whole episodes.
+      rng: random generator.
       batch_size: B.
-      frame_stack: frames in an observation; an episode's first frame stands in for
-        those before it.
-      successors: whether to add the observations one step later.
+      frame_stack: frames in an observation; the first is repeated at the start.
+      successors: whether to add the next observations.
 
     Returns:
       Observations uint8 [B, H, W, 3 * frame_stack] or float32 [B, S], and actions
-      [B, A]; A is 0 where the demonstrations have none.
+      [B, A]; A is 0 if they are unknown.
     """
     found = sample_indices(
         demonstrations,
@@ -198,7 +184,7 @@ def sample(
         frame_stack=frame_stack,
         successors=successors,
     )
-    # As one long row of frames, without a copy, from which stacks are gathered.
+    # All episodes end to end, without a copy.
     frames = demonstrations.frames.reshape(-1, *demonstrations.frames.shape[2:])
     successor = found.successor
     return found._replace(
@@ -215,11 +201,11 @@ def sample_indices(
     frame_stack: int,
     successors: bool = False,
 ) -> ExpertBatch:
-    """Samples what `sample` does, with the indices of frames instead of pixels.
+    """Samples like `sample`, with frame indices instead of pixels.
 
     Returns:
-      Observations int32 [B, frame_stack]: indices, the oldest first, into the frames of
-      all episodes laid end to end, [K * (N + 1), ...].
+      Observations int32 [B, frame_stack]: indices, oldest first, into the frames of all
+      episodes end to end, [K * (N + 1), ...].
     """
     num_steps = demonstrations.num_frames - 1  # no action follows the last frame
     ends = np.cumsum(num_steps)
@@ -259,41 +245,28 @@ def _open_states(
     action_repeat: int,
     frame_skip: int,
 ) -> tuple[StateDemonstrations, int]:
-    """Returns a file's contents, and how many stored steps make one of the agent's."""
+    """Returns a file's content, and the stored steps per agent step."""
     stored = states.read_states(path, task=task, num_episodes=num_episodes)
     recorded = stored.metadata["action_repeat"]
     if action_repeat < 1 or action_repeat % recorded:
-        raise fault(
-            path,
-            f"was recorded with action_repeat={recorded}, which cannot serve "
-            f"action_repeat={action_repeat}",
-            f"Take a multiple of {recorded}, or record it again",
-        )
+        what = f"was recorded with action_repeat={recorded}, not {action_repeat}"
+        raise fault(path, what, f"Use a multiple of {recorded}, or record it again")
     if frame_skip != 1:
-        raise fault(
-            path,
-            f"holds states, which follow action_repeat, and frame_skip={frame_skip} "
-            "is for pixels",
-            "Set demonstrations.frame_skip to 1",
-        )
+        what = f"holds states, but frame_skip={frame_skip} is for pixels"
+        raise fault(path, what, "Set demonstrations.frame_skip to 1")
     stride = action_repeat // recorded
     if stride > stored.rewards.shape[1]:
-        raise fault(
-            path,
-            f"has episodes shorter than one step of action_repeat={action_repeat}",
-            "Choose a smaller action_repeat",
-        )
+        what = f"has episodes shorter than one step of action_repeat={action_repeat}"
+        raise fault(path, what, "Choose a smaller action_repeat")
     for name, size in _model_sizes(task).items():
         found = getattr(stored, name).shape[2]
         if found != size:
-            raise fault(
-                path, f"has {name} of {found} numbers, where {task} needs {size}"
-            )
+            raise fault(path, f"has {name} of {found} numbers, but {task} needs {size}")
     return stored, stride
 
 
 def _load_pixels(path: pathlib.Path, *request: Any) -> Demonstrations:
-    """Reads a foreign file, or returns it again if it was the last one read."""
+    """Reads a file of pixels, or returns it again if it was the last one read."""
     try:
         parts = sorted(path.rglob("*")) if path.is_dir() else [path]
         stamps = tuple((str(part), part.stat().st_mtime_ns) for part in parts)
@@ -302,8 +275,7 @@ def _load_pixels(path: pathlib.Path, *request: Any) -> Demonstrations:
     return _read_pixels(path, stamps, *request)
 
 
-# Checked at the door and loaded afterwards: both are one reading. The pixels that this
-# keeps are those that the run keeps anyhow.
+# `check` and `load` share one reading. The run keeps these pixels in memory anyway.
 @functools.lru_cache(maxsize=1)
 def _read_pixels(
     path: pathlib.Path,
@@ -317,17 +289,11 @@ def _read_pixels(
 ) -> Demonstrations:
     del stamps  # part of the key only
     if observation != "pixels":
-        raise fault(
-            path,
-            f"holds pixels or is damaged, and cannot serve observation={observation!r}",
-            "Set observation to 'pixels', or name a file of states",
-        )
+        what = f"holds pixels or is damaged, but observation={observation!r}"
+        raise fault(path, what, "Set observation to 'pixels', or use a file of states")
     if num_episodes < 1 or frame_skip < 1:
-        raise fault(
-            path,
-            f"cannot serve num_episodes={num_episodes} with frame_skip={frame_skip}",
-            "Both are at least 1",
-        )
+        what = f"does not fit num_episodes={num_episodes} and frame_skip={frame_skip}"
+        raise fault(path, what, "Both must be at least 1")
     try:
         read = foreign.read_episodes(
             path,

@@ -1,4 +1,4 @@
-"""Warnings: how demonstrations differ from what the agent itself sees."""
+"""Warns where demonstrations differ from the agent's observations."""
 
 import logging
 import pathlib
@@ -6,8 +6,7 @@ from typing import Any
 
 from jaxil.environments import suite
 
-# A video's frame rate may be off by this share before anyone is told.
-_RATE_TOLERANCE = 0.1
+_RATE_TOLERANCE = 0.1  # relative, of a video's frame rate
 
 _logger = logging.getLogger(__name__)
 
@@ -20,19 +19,14 @@ def warn_of_pixels(
     task: str,
     action_repeat: int,
 ) -> None:
-    """Warns where a foreign file cannot match the agent's view.
+    """Warns where a file of pixels differs from the agent's settings.
 
-    Args:
-      path: the file.
-      metadata: of `Demonstrations` that were read from pixels.
-      image_size: the agent's, as are task and action repeat.
-      task: `domain_task`.
-      action_repeat: environment frames per agent step.
+    `metadata` is that of the loaded `Demonstrations`.
     """
     size, (height, width) = image_size, metadata["stored_size"]
     messages = [
-        f"{path} ({metadata['kind']}) holds pixels of another renderer: light, colour "
-        "and camera may differ from what the agent sees."
+        f"{path} ({metadata['kind']}) holds pixels of another renderer: light, colours "
+        "and camera may differ from the agent's."
     ]
     if (height, width) != (size, size):
         squeezed = "" if height == width else ", squeezed into a square"
@@ -43,16 +37,15 @@ def warn_of_pixels(
     repeat = metadata["action_repeat"]
     if repeat is not None and repeat != action_repeat:
         messages.append(
-            f"{path} was recorded with action_repeat={repeat}, and the run has "
-            f"{action_repeat}: set action_repeat or demonstrations.frame_skip so that "
-            "they agree."
+            f"{path} was recorded with action_repeat={repeat}, but the run has "
+            f"{action_repeat}: adjust action_repeat or demonstrations.frame_skip."
         )
     speed = metadata["frames_per_second"]
     wanted = 1.0 / suite.decision_seconds(task, action_repeat)
     if speed is not None and abs(speed / wanted - 1.0) > _RATE_TOLERANCE:
         messages.append(
-            f"{path} has {speed:.3g} frames per second, and the agent makes "
-            f"{wanted:.3g} steps: about {speed / wanted:.3g} frames make one step. "
+            f"{path} has {speed:.3g} frames per second, but the agent makes "
+            f"{wanted:.3g} steps: about {speed / wanted:.3g} frames per step. "
             "Adjust demonstrations.frame_skip or action_repeat."
         )
     messages += [f"{path}: {note}" for note in metadata["notes"]]
@@ -61,7 +54,7 @@ def warn_of_pixels(
 
 
 def warn_of_versions(path: pathlib.Path, recorded: dict[str, str]) -> None:
-    """Warns where simulator versions differ from those that recorded a state file."""
+    """Warns if a file of states was recorded with other simulator versions."""
     differing = [
         f"{name} {recorded.get(name)} (here {version})"
         for name, version in suite.simulator_versions().items()
@@ -69,7 +62,7 @@ def warn_of_versions(path: pathlib.Path, recorded: dict[str, str]) -> None:
     ]
     if differing:
         _logger.warning(
-            "%s was recorded with %s: the task may move or look slightly different.",
+            "%s was recorded with %s: motion and appearance may differ slightly.",
             path,
             ", ".join(differing),
         )

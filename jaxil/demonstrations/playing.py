@@ -1,4 +1,4 @@
-"""Plays episodes and keeps the simulator's states."""
+"""Records episodes of simulator states."""
 
 from collections.abc import Callable
 
@@ -15,16 +15,13 @@ def play(
     num_episodes: int,
     finished: Callable[[int, float], None] = lambda episode, task_return: None,
 ) -> dict[str, np.ndarray]:
-    """Plays episodes 0 ... K - 1; returns `StateDemonstrations` without metadata.
+    """Plays episodes 0 ... K - 1; returns the arrays of `StateDemonstrations`.
 
     Args:
       environment: used by nothing else.
-      begin: episode -> what decides in it, called after its reset.
+      begin: episode number -> its controller; called after the reset.
       num_episodes: K.
       finished: called with each episode's number and return.
-
-    Returns:
-      `qpos`, `qvel`, `act`, `actions` and `rewards`, each [K, ...].
     """
     episodes = []
     for episode in range(num_episodes):

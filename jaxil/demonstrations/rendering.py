@@ -1,4 +1,4 @@
-"""Images of stored simulator states, rendered once per machine and then cached."""
+"""Renders stored simulator states, in parallel, and caches the images."""
 
 import concurrent.futures
 import contextlib
@@ -23,12 +23,12 @@ from jaxil.environments.pool import interrupts_blocked
 from jaxil.files import archive
 from jaxil.machine.cache import cache_folder
 
-# Part of each key: raise it when rendering changes in a way that the key cannot see.
+# Part of each key; increment it when images change for a reason not in the key.
 _CACHE_VERSION = 2
-_MAX_PROCESSES = 8  # some 250 MB each
-# Some seconds of software rendering: less is done before another process has started.
-_WORTH_PIXELS = 2_000_000
-_SILENCE_SECONDS = 1800.0  # without a finished episode, until they are given up
+_MAX_PROCESSES = 8  # of about 250 MB
+# Seconds of software rendering; fewer pixels are done before a process has started.
+_MIN_PARALLEL_PIXELS = 2_000_000
+_TIMEOUT_SECONDS = 1800.0  # for the next episode of any process
 _SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer")
 
 States = dict[str, np.ndarray]  # `qpos`, `qvel` and `act` of one episode, [N + 1, n]
@@ -49,27 +49,25 @@ def observe_episodes(
     progress: Callable[[int, int], None] | None = None,
     processes: int | None = None,
 ) -> np.ndarray:
-    """Shows stored episodes as the agent's own environment would.
+    """Observes stored episodes with the agent's own environment.
+
+    Arguments not listed are those of `suite.make_environment`.
 
     Args:
       states: `qpos`, `qvel` and `act`, each of shape [K, N + 1, n].
-      task: `domain_task`.
-      seed: of the environment that recorded them.
-      first_episode: number of episode 0 there. With the seed it restores what the
-        states lack: targets, terrain.
-      image_size: height and width in pixels.
-      render_quality: "paper", "fast" or "smooth".
-      observation: "pixels" or "state".
-      cache: whether images are looked up in, and added to, `cache_folder()`.
-      progress: called with (images rendered, images in all), if any have to be.
-      processes: how many render; None for as many as pay. The images are the same.
+      seed: of the recording environment.
+      first_episode: number of the first episode there. With the seed it restores what
+        is not in the states: targets, terrain.
+      cache: whether to read and write images in `cache_folder()`.
+      progress: called with (images done, all images) while rendering.
+      processes: None chooses the number. The images do not depend on it.
 
     Returns:
       Images, uint8 [K, N + 1, H, W, 3], or states, float32 [K, N + 1, S].
 
     Raises:
-      ValueError: the states don't fit the task's model, or see `make_environment`.
-      RuntimeError: nothing here can render.
+      ValueError: the states do not fit the task's model, or see `make_environment`.
+      RuntimeError: rendering is not available.
     """
     settings = {
         "task": task,
@@ -125,7 +123,7 @@ def observe_episodes(
             processes = 1
         elif processes is None:
             num_pixels = len(missing) * length * image_size**2
-            processes = how_many(num_pixels, environment.renderer.gl_name())
+            processes = num_processes(num_pixels, environment.renderer.gl_name())
         if processes > 1 and len(missing) > 1:
             rendered = _render_together(
                 min(processes, len(missing)),
@@ -147,17 +145,11 @@ def observe_episodes(
     return observed
 
 
-def how_many(num_pixels: int, gl_name: str) -> int:
-    """Returns how many processes should render; 1 where more don't pay.
-
-    Args:
-      num_pixels: of all images.
-      gl_name: what renders, see `Renderer.gl_name`.
-    """
-    # GPUs are fast enough alone, and EGL contexts of several processes at once have
-    # been seen to hang there.
+def num_processes(num_pixels: int, gl_name: str) -> int:
+    """Returns the fastest number of processes for all images together."""
+    # One process is fast enough on a GPU, where parallel EGL contexts may hang.
     is_software = any(name in gl_name.lower() for name in _SOFTWARE)
-    if not is_software or num_pixels < _WORTH_PIXELS:
+    if not is_software or num_pixels < _MIN_PARALLEL_PIXELS:
         return 1
     return min(len(os.sched_getaffinity(0)), _MAX_PROCESSES)
 
@@ -165,9 +157,9 @@ def how_many(num_pixels: int, gl_name: str) -> int:
 def _images(
     environment: PixelEnvironment, number: int, states: States
 ) -> Iterator[np.ndarray]:
-    """Renders the moments of an episode one by one, uint8 [H, W, 3].
+    """Yields the images of an episode, uint8 [H, W, 3].
 
-    The environment is reset to the episode: that alone tells what the states lack.
+    The reset restores what is not in the states.
     """
     environment.reset(episode=number)
     for values in zip(*states.values(), strict=True):
@@ -178,10 +170,10 @@ def _images(
 def _render_together(
     processes: int, episodes: dict[int, States], settings: dict[str, Any], gl_name: str
 ) -> Generator[tuple[int, np.ndarray], None, None]:
-    """Yields episodes' numbers and images in any order, until one fails.
+    """Yields episode numbers and images in any order, until an episode fails.
 
-    A software renderer hardly uses more than one core for a small image, so processes
-    divide the time by their number. None of them is left when the generator is closed.
+    Software renderers use one core for small images, so the speed grows with the number
+    of processes. Closing the generator ends them.
     """
     executor = concurrent.futures.ProcessPoolExecutor(
         processes,
@@ -198,19 +190,19 @@ def _render_together(
         pending = set(numbers)
         while pending:
             done, pending = concurrent.futures.wait(
-                pending, _SILENCE_SECONDS, concurrent.futures.FIRST_COMPLETED
+                pending, _TIMEOUT_SECONDS, concurrent.futures.FIRST_COMPLETED
             )
             if not done:
-                raise TimeoutError(f"no episode in {_SILENCE_SECONDS:g} s")
+                raise TimeoutError(f"no episode in {_TIMEOUT_SECONDS:g} s")
             for future in done:
                 yield numbers[future], future.result()
     except Exception as error:
         _logger.warning(
-            "processes that render failed (%s); the rest is rendered without them",
+            "parallel rendering failed (%s); continuing in one process",
             str(error) or type(error).__name__,
         )
     finally:
-        # Killed, because GL drivers have been seen to hang while they clean up.
+        # Killed, because cleanup in GL drivers may hang.
         for process in set(multiprocessing.active_children()) - others:
             process.kill()
         executor.shutdown()
@@ -218,7 +210,7 @@ def _render_together(
 
 @contextlib.contextmanager
 def _main_hidden() -> Iterator[None]:
-    """Keeps spawned processes from importing, that is running, the caller's script."""
+    """Keeps spawned processes from importing, and so running, the caller's script."""
     main = sys.modules["__main__"]
     sys.modules["__main__"] = types.ModuleType("__main__")
     try:
@@ -228,8 +220,8 @@ def _main_hidden() -> Iterator[None]:
 
 
 def _end_with_parent() -> None:
-    """Lets a process of the executor end when its parent is killed."""
-    os.environ.setdefault("LP_NUM_THREADS", "0")  # of llvmpipe: we use the cores
+    """Ends a process of the executor when its parent is killed."""
+    os.environ.setdefault("LP_NUM_THREADS", "0")  # one llvmpipe thread per process
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -243,11 +235,11 @@ def _end_with_parent() -> None:
 def _render_episode(
     settings: dict[str, Any], gl_name: str, number: int, states: States
 ) -> np.ndarray:
-    """Runs in another process; returns an episode's images [N + 1, H, W, 3]."""
+    """Renders an episode in another process: [N + 1, H, W, 3]."""
     environment = _own_environment(**settings)
     found = environment.renderer.gl_name()
     if found != gl_name:
-        raise RuntimeError(f"they render with {found}, not with {gl_name}")
+        raise RuntimeError(f"rendered with {found}, not with {gl_name}")
     return np.stack(list(_images(environment, number, states)))
 
 
@@ -255,7 +247,7 @@ _own_environment = functools.cache(suite.make_environment)
 
 
 def _cache_path(about: dict[str, Any], states: States) -> pathlib.Path:
-    """Returns a file whose name changes with all that changes an episode's pixels."""
+    """Returns the cache file of an episode; its name is a hash of all inputs."""
     digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
     for name, array in sorted(states.items()):
         digest.update(f"{name}{array.dtype.str}{array.shape}".encode())
@@ -265,9 +257,9 @@ def _cache_path(about: dict[str, Any], states: States) -> pathlib.Path:
 
 
 def _read_cached(path: pathlib.Path, images: np.ndarray) -> bool:
-    """Fills `images` from a cached file, if that is undamaged and of its shape.
+    """Fills `images` from a cached file; returns whether that is whole and fits.
 
-    The archive holds a checksum of the pixels, which is verified.
+    The archive's checksum of the pixels is verified.
     """
     try:
         limits = {"images": images.nbytes + 1000}
@@ -281,12 +273,12 @@ def _read_cached(path: pathlib.Path, images: np.ndarray) -> bool:
 
 
 def _write_cached(path: pathlib.Path, images: np.ndarray) -> None:
-    """Stores images, or warns. Several processes may store the same."""
+    """Stores images, or warns."""
     try:
         archive.write_archive(path, [("images", images)], compressed=False)
     except OSError as error:
         _logger.warning(
-            "images are not cached, so the next run renders them again: %s. "
-            "JAXIL_CACHE=DIR names another folder.",
+            "images are not cached and will be rendered again: %s. Set "
+            "JAXIL_CACHE=DIR to use another folder.",
             error,
         )

@@ -1,13 +1,13 @@
-"""The file format of demonstrations: simulator states, actions, rewards, metadata.
+"""The file format of recorded demonstrations: simulator states instead of pixels.
 
-Such a file is a NumPy archive (.npz) of K episodes of T agent steps:
+A NumPy archive (.npz) of K episodes of T agent steps:
 
     qpos, qvel, act   float64 [K, T + 1, nq], [K, T + 1, nv], [K, T + 1, na]
     actions, rewards  float32 [K, T, A], [K, T]
-    metadata          a JSON text, see `new_metadata`
+    metadata          JSON text, see `new_metadata`
 
-Pixels are not stored: they would be a thousand times larger, and would not match the
-renderer of another machine. Baselines alone may look at actions and rewards.
+Pixels would take a thousand times the space and would not match another machine's
+renderer.
 """
 
 import importlib.metadata
@@ -23,9 +23,8 @@ from jaxil.files import archive
 
 FORMAT = "jaxil-demonstrations"
 VERSION = 1
-MAX_ARRAY_BYTES = archive.MAX_BYTES
 _MAX_METADATA_BYTES = 1024**2
-_ARRAYS = {  # name: dtype, number of axes, states per episode beyond its steps
+_ARRAYS = {  # name: dtype, number of axes, entries beyond T
     "qpos": (np.dtype(np.float64), 3, 1),
     "qvel": (np.dtype(np.float64), 3, 1),
     "act": (np.dtype(np.float64), 3, 1),
@@ -43,23 +42,17 @@ _METADATA = {
     "returns": list,
 }
 _CHECK_PATH = "Check the path in demonstrations.source"
-_REMAKE = "Record it again with `python -m jaxil.collect`, or name another file"
+_REMAKE = "Record it again with `python -m jaxil.collect`, or use another file"
 
 
 class DemonstrationError(ValueError):
-    """Demonstrations cannot be used; says which file, why, and what helps."""
+    """Demonstrations cannot be used; the message names file, reason and remedy."""
 
 
 class StateDemonstrations(NamedTuple):
-    """What a demonstration file holds.
+    """The content of a file; shapes as above.
 
-    Attributes:
-      qpos: positions, float64 [K, T + 1, nq].
-      qvel: velocities, float64 [K, T + 1, nv].
-      act: activations of the actuators, float64 [K, T + 1, na].
-      actions: float32 [K, T, A], in [-1, 1].
-      rewards: the task's, summed over the action repeat. float32 [K, T].
-      metadata: see `new_metadata`.
+    Actions are in [-1, 1]; rewards are the task's, summed over the action repeat.
     """
 
     qpos: np.ndarray
@@ -72,7 +65,7 @@ class StateDemonstrations(NamedTuple):
     def simulator_states(
         self, times: np.ndarray | slice, episodes: slice = slice(None)
     ) -> dict[str, np.ndarray]:
-        """Returns `qpos`, `qvel` and `act` of some episodes at some times."""
+        """Returns `qpos`, `qvel` and `act` of given episodes and times."""
         named = {name: getattr(self, name) for name in ("qpos", "qvel", "act")}
         return {name: array[episodes, times] for name, array in named.items()}
 
@@ -86,16 +79,16 @@ def new_metadata(
     expert: str,
     rewards: np.ndarray,
 ) -> dict[str, Any]:
-    """Returns the metadata of freshly recorded demonstrations.
+    """Returns the metadata of newly recorded demonstrations.
 
     Args:
       task: `domain_task`.
       action_repeat: environment frames per stored step.
-      seed: the recording environment's; with the episode's number it restores what
-        a task samples at random beyond the state.
-      first_episode: number of episode 0; the others follow it without a gap.
-      expert: how the expert was made, for people.
-      rewards: task rewards. Shape [K, T].
+      seed: of the recording environment; with an episode's number it restores what is
+        randomized outside the state.
+      first_episode: number of the first of K consecutive episodes.
+      expert: how the expert was made, as text.
+      rewards: the task's. Shape [K, T].
     """
     return {
         "format": FORMAT,
@@ -115,32 +108,24 @@ def new_metadata(
 
 
 def shipped_tasks() -> tuple[str, ...]:
-    """Returns the tasks whose demonstrations are part of the package, sorted."""
+    """Returns the tasks with shipped demonstrations, sorted."""
     return tuple(sorted(path.stem for path in _shipped_folder().glob("*.npz")))
 
 
 def shipped_path(task: str) -> pathlib.Path:
-    """Returns the package's own demonstrations of `task`.
-
-    Raises:
-      DemonstrationError: none are shipped for it.
-    """
+    """Returns the shipped demonstrations of a task, or raises DemonstrationError."""
     path = _shipped_folder() / f"{task}.npz"
     if task not in shipped_tasks():
         raise DemonstrationError(
             f"no demonstrations of {task} are shipped, only of: "
             f"{', '.join(shipped_tasks()) or 'no task'}. Record some with "
-            "`python -m jaxil.collect` and name the file in demonstrations.source."
+            "`python -m jaxil.collect`, and set demonstrations.source to the file."
         )
     return path
 
 
 def write_states(path: str | os.PathLike, demonstrations: StateDemonstrations) -> None:
-    """Writes a demonstration file, whole or not at all.
-
-    Raises:
-      DemonstrationError: the arrays or the metadata break the format's rules.
-    """
+    """Writes a file atomically; DemonstrationError if the content is invalid."""
     path = pathlib.Path(path)
     _check(path, demonstrations)
     arrays = {
@@ -152,29 +137,22 @@ def write_states(path: str | os.PathLike, demonstrations: StateDemonstrations) -
 
 
 def recognises(path: pathlib.Path) -> bool:
-    """Returns whether `path` is a file of this format, judged by its arrays' names.
-
-    Raises:
-      DemonstrationError: it is neither a file nor a folder, but a device or a pipe.
-    """
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        raise fault(path, "is neither a file nor a folder", _CHECK_PATH)
+    """Returns whether a file has this format, by the names of its arrays."""
     return "qpos" in archive.member_names(path)
 
 
 def read_states(
     path: str | os.PathLike, *, task: str | None = None, num_episodes: int | None = None
 ) -> StateDemonstrations:
-    """Reads a demonstration file and checks all of it; nothing is rendered.
+    """Reads and checks a whole file, without rendering.
 
     Args:
       path: the file.
-      task: the task that it must be of; None takes any.
-      num_episodes: how many episodes to return, the first ones; None for all.
+      task: the required task; None for any.
+      num_episodes: returns the first ones; None for all.
 
     Raises:
-      DemonstrationError: the file cannot be read, is not one of demonstrations,
-        is damaged, or is not what was asked for.
+      DemonstrationError: the file cannot be read, is damaged, or does not fit.
     """
     path = pathlib.Path(path)
     limits = dict.fromkeys(_ARRAYS, archive.MAX_BYTES)
@@ -196,11 +174,8 @@ def read_states(
     if num_episodes is None:
         return demonstrations
     if not 1 <= num_episodes <= stored:
-        raise fault(
-            path,
-            f"holds {stored} episodes, and num_episodes={num_episodes} were asked for",
-            f"Ask for 1 to {stored}",
-        )
+        what = f"holds {stored} episodes, but num_episodes={num_episodes}"
+        raise fault(path, what, f"Use 1 to {stored}")
     kept = [array[:num_episodes] for array in demonstrations[:-1]]
     metadata = {**metadata, "returns": metadata["returns"][:num_episodes]}
     return StateDemonstrations(*kept, metadata=metadata)
@@ -211,19 +186,17 @@ def _shipped_folder() -> pathlib.Path:
 
 
 def fault(path: pathlib.Path, what: str, way_out: str = _REMAKE) -> DemonstrationError:
-    """Returns the error that says what is wrong with a file, and what helps."""
+    """Returns the error for a file, with a remedy."""
     return DemonstrationError(f"{path} {what}. {way_out}.")
 
 
 def other_task(path: pathlib.Path, shown: str, task: str) -> DemonstrationError:
-    """Returns what to raise where a file shows another task than the run's."""
-    return fault(
-        path, f"shows {shown}, but the task is {task}", "Set the one to the other's"
-    )
+    """Returns the error for a file of another task."""
+    return fault(path, f"shows {shown}, but the task is {task}", "Change one of them")
 
 
 def unreadable(path: pathlib.Path, error: OSError) -> DemonstrationError:
-    """Returns what to raise where the system refuses a file."""
+    """Returns the error for a file that cannot be opened."""
     return fault(path, f"cannot be read ({error.strerror or error})", _CHECK_PATH)
 
 
@@ -235,16 +208,13 @@ def _check(path: pathlib.Path, demonstrations: StateDemonstrations) -> None:
 
 def _metadata_fault(metadata: Any) -> str | None:
     if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
-        return "is not a file of demonstrations: its metadata lack the format's name"
+        return "is not a file of demonstrations: its metadata lack the format name"
     if metadata.get("version") != VERSION:
-        return (
-            f"has version {metadata.get('version')!r} of the format, where this "
-            f"program reads version {VERSION}"
-        )
+        return f"has version {metadata.get('version')!r} of the format, not {VERSION}"
     for name, kind in _METADATA.items():
         value = metadata.get(name)
         if not isinstance(value, kind) or isinstance(value, bool):
-            return f"has metadata {name}={value!r}, where {kind.__name__} is expected"
+            return f"has metadata {name}={value!r}, but {kind.__name__} is expected"
     for name, least in (("action_repeat", 1), ("seed", 0), ("first_episode", 0)):
         if metadata[name] < least:
             return f"has metadata {name}={metadata[name]}, which is below {least}"
@@ -254,23 +224,20 @@ def _metadata_fault(metadata: Any) -> str | None:
 def _array_fault(demonstrations: StateDemonstrations) -> str | None:
     rewards = demonstrations.rewards
     if rewards.ndim != 2 or 0 in rewards.shape:
-        return f"has rewards of shape {rewards.shape}, where [K, T] is expected"
+        return f"has rewards of shape {rewards.shape}, but [K, T] is expected"
     num_episodes, num_steps = rewards.shape
     for name, (dtype, num_axes, extra) in _ARRAYS.items():
         array = getattr(demonstrations, name)
         if array.dtype != dtype:
-            return f"has {name} of type {array.dtype}, where {dtype} is expected"
+            return f"has {name} of type {array.dtype}, but {dtype} is expected"
         shape = (num_episodes, num_steps + extra)
         if array.ndim != num_axes or array.shape[:2] != shape:
-            return (
-                f"has {name} of shape {array.shape}, which does not fit rewards of "
-                f"shape {rewards.shape}"
-            )
+            return f"has {name} of shape {array.shape} for rewards of {rewards.shape}"
         if not np.isfinite(array).all():
             episode = int(np.argwhere(~np.isfinite(array))[0, 0])
             return f"has a NaN or infinity in {name}, episode {episode}"
     returns = demonstrations.metadata["returns"]
     are_numbers = all(isinstance(x, int | float) and abs(x) < 1e300 for x in returns)
     if len(returns) != num_episodes or not are_numbers:
-        return f"has metadata returns={returns!r}, where {num_episodes} numbers belong"
+        return f"has metadata returns={returns!r}, but {num_episodes} are expected"
     return None

@@ -1,1 +1,1 @@
-"""Simulated environments, one or several, and playing episodes in them."""
+"""Simulated environments, and playing episodes in them."""

@@ -6,22 +6,22 @@ from typing import Any
 import numpy as np
 
 RENDER_QUALITIES = ("paper", "fast", "smooth")
-# Shadow maps and four-fold supersampling are most of a software renderer's work.
+# Shadow maps and supersampling take most of a software renderer's time.
 _FAST_FLAGS = {"shadow": False, "reflection": False}
-# "smooth" renders this many times larger and averages: without it, a thin pole jumps
-# from pixel to pixel, and nothing in a small image shows how fast it turns.
+# "smooth" renders at twice the size and averages. Otherwise a thin pole jumps between
+# pixels, and small images do not show its speed.
 _SMOOTH_FACTOR = 2
 
-# (physics, height and width in pixels, index) to a dm_control `Camera`. Raises
+# (physics, height and width in pixels, camera index) -> dm_control `Camera`. Raises
 # RuntimeError or ImportError without usable GL.
 OpenCamera = Callable[[Any, int, int], Any]
 
 
 class Renderer:
-    """One camera on one simulation, kept for as long as the simulation lives.
+    """One camera of one simulation, created once.
 
-    dm_control's own `physics.render` builds camera and scene for each image, which in
-    software takes longer than rendering.
+    dm_control's `physics.render` creates camera and scene for each image, which takes
+    longer than software rendering itself.
     """
 
     def __init__(
@@ -33,60 +33,46 @@ class Renderer:
         camera: int,
         render_quality: str,
     ):
-        """Prepares to render; the GL context is made at the first image.
+        """Sets up the model; the first image creates the GL context.
 
         Args:
           physics: a dm_control `Physics` that has not been rendered yet.
-          open_camera: called at the first image.
+          open_camera: see `OpenCamera`.
           image_size: height and width in pixels.
           camera: index of a camera of the model.
           render_quality: "paper" for dm_control's defaults; "fast" without
             supersampling, shadows and reflections; "smooth" for "fast" at twice the
             size, averaged over 2x2 pixels.
-
-        Raises:
-          ValueError: unknown quality, or a size below one.
         """
-        if render_quality not in RENDER_QUALITIES:
-            raise ValueError(
-                f"render_quality={render_quality!r} is unknown; choose one of: "
-                f"{', '.join(RENDER_QUALITIES)}."
-            )
-        if image_size < 1:
-            raise ValueError(f"image_size={image_size} must be at least 1 pixel.")
         self._physics, self._open_camera = physics, open_camera
         self.image_size, self._camera_index = image_size, camera
         self._flags = None if render_quality == "paper" else _FAST_FLAGS
         self._factor = _SMOOTH_FACTOR if render_quality == "smooth" else 1
         self._camera = None
         vis = physics.model.vis
-        # All are read when the GL context is made, so they must be set before.
+        # These are read when the GL context is created.
         if render_quality != "paper":
             vis.quality.offsamples = 0
-            # Spheres of fewer triangles: half or less of the time, 0.1 to 0.2 grey
-            # levels of mean difference at 48x48.
+            # Fewer triangles per sphere halve the time or better, and change pixels by
+            # 0.1 to 0.2 grey levels on average at 48x48.
             vis.quality.numslices, vis.quality.numstacks = 12, 8
         self._size = self._factor * image_size
         vis.global_.offwidth = max(int(vis.global_.offwidth), self._size)
         vis.global_.offheight = max(int(vis.global_.offheight), self._size)
 
     def render(self) -> np.ndarray:
-        """Returns a new image of the simulation as it is now, uint8 [H, W, 3].
-
-        Raises:
-          RuntimeError: this machine has no usable GL.
-        """
+        """Returns a new image, uint8 [H, W, 3]; RuntimeError without usable GL."""
         image = self._opened().render(render_flag_overrides=self._flags)
         n, size = self._factor, self.image_size
         if n == 1:
-            return image.copy()  # the camera overwrites its one buffer
+            return image.copy()  # the camera reuses its buffer
         total = np.full((size, size, 3), n * n // 2, np.uint16)
         for i, j in np.ndindex(n, n):
             total += image[i::n, j::n]
         return (total // (n * n)).astype(np.uint8)
 
     def gl_name(self) -> str:
-        """Returns GL's name of the device that renders, such as "llvmpipe (...)"."""
+        """Returns GL's name of the rendering device, e.g. "llvmpipe (...)"."""
         self._opened()
         from OpenGL import GL
 
@@ -102,7 +88,7 @@ class Renderer:
                 )
             except (RuntimeError, ImportError) as error:
                 raise RuntimeError(
-                    f"nothing here can render: {error} "
+                    f"rendering is not available: {error} "
                     "`python -m jaxil.doctor` says what to install."
                 ) from error
         return self._camera

@@ -1,4 +1,4 @@
-"""How good a policy is by the task's own reward."""
+"""Evaluates a policy by the task's reward."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,17 +12,11 @@ Act = Callable[[np.ndarray], np.ndarray]  # observation -> action [A]
 
 
 class Evaluation(NamedTuple):
-    """Episodes of one policy.
+    """E episodes of one policy."""
 
-    Attributes:
-      episodes: E of them.
-      task_returns: undiscounted sums of the task's reward. Shape [E].
-      video: images of the first episode, uint8 [T + 1, H, W, 3]; None if not asked for.
-    """
-
-    episodes: list[Episode]
-    task_returns: np.ndarray
-    video: np.ndarray | None
+    episodes: list[Episode]  # with the task's rewards
+    task_returns: np.ndarray  # undiscounted. Shape [E]
+    video: np.ndarray | None  # of the first episode, uint8 [T + 1, H, W, 3]
 
     @property
     def mean(self) -> float:
@@ -36,7 +30,7 @@ class Evaluation(NamedTuple):
 
 
 class Stopped(Exception):
-    """Someone asked to stop in the middle of an evaluation."""
+    """The evaluation was asked to stop."""
 
 
 def evaluate(
@@ -48,18 +42,15 @@ def evaluate(
     record_video: bool = False,
     stop_asked: Callable[[], bool] = lambda: False,
 ) -> Evaluation:
-    """Plays whole episodes without learning.
+    """Plays whole episodes.
 
     Args:
-      environment: an `Environment` that nothing else uses, with `frame()` for videos.
-      act: the policy; deterministic for the numbers that are reported.
+      environment: an `Environment` used by nothing else, with `frame()` for videos.
+      act: the policy.
       num_episodes: at least 1.
-      first_episode: number of the first, which fixes how each one starts.
+      first_episode: number of the first episode; it determines the initial states.
       record_video: whether to keep the first episode's images.
-      stop_asked: asked before each agent step.
-
-    Raises:
-      Stopped: `stop_asked` returned True.
+      stop_asked: called before each agent step; True raises `Stopped`.
     """
     player = Player(InProcess(environment), first_episode=first_episode)
     episodes: list[Episode] = []

@@ -10,19 +10,16 @@ from dm_env import specs
 from jaxil.environments.camera import Renderer
 from jaxil.replay.stacking import gather_stacks
 
-_SEED_WORDS = 8
-# MuJoCo's stand-in for "no bound" on an actuator; no sensible range to rescale to.
-_UNBOUNDED = 1e9
+_UNBOUNDED = 1e9  # MuJoCo's value for an actuator without limits
 
 
 class PixelEnvironment(dm_env.Environment):
-    """A suite task seen through its camera; an `interaction.Environment`.
+    """A suite task as an `interaction.Environment`.
 
-    Time runs in agent steps, each of `action_repeat` environment frames. The last
-    `frame_stack` images form one observation, uint8 [H, W, 3 * frame_stack], oldest
-    first; at a reset the first image stands for the missing ones. With
-    `observation="state"` it is the suite's own observation of the present, flattened,
-    float32 [S], and nothing is rendered unless asked for.
+    One agent step is `action_repeat` environment frames. An observation is the last
+    `frame_stack` images, uint8 [H, W, 3 * frame_stack], oldest first; at a reset the
+    first image is repeated. With `observation="state"` it is the suite's observation,
+    flattened, float32 [S], and nothing is rendered unless requested.
     """
 
     def __init__(
@@ -36,15 +33,15 @@ class PixelEnvironment(dm_env.Environment):
         observation: str,
         renderer: Renderer,
     ):
-        """Wraps `suite_environment`; see `make_environment` for the arguments."""
+        """Wraps `suite_environment`; arguments as for `make_environment`."""
         self._suite_environment = suite_environment
         self._name, self._seed = task, seed
         self._action_repeat = action_repeat
         self._renders = observation == "pixels"
         self.renderer = renderer
-        self.num_episodes_started = 0  # the number of the next `reset()`
+        self._next_episode = 0
         self._reset_next_step = True
-        self._current: np.ndarray | None = None  # frame of the present, once known
+        self._current: np.ndarray | None = None  # newest frame, once rendered
         self._frames: list[np.ndarray] = []  # of the observation
         self._frame_stack = frame_stack
         bounds = suite_environment.action_spec()
@@ -77,43 +74,34 @@ class PixelEnvironment(dm_env.Environment):
             )
 
     def reset(self, episode: int | None = None) -> dm_env.TimeStep:
-        """Starts an episode.
+        """Starts an episode, whose number and the seed determine the initial state.
 
-        Args:
-          episode: number of the episode, from 0: with the seed it fixes the start,
-            whatever was played before. None takes the number after the last one.
+        Without a number it is the one after the last.
         """
         if episode is None:
-            episode = self.num_episodes_started
+            episode = self._next_episode
         if episode < 0:
             raise ValueError(f"episode={episode} must not be negative.")
-        words = np.random.SeedSequence([self._seed, episode]).generate_state(
-            _SEED_WORDS
-        )
-        self._suite_environment.task.random.seed(words)
+        seeds = np.random.SeedSequence([self._seed, episode])
+        self._suite_environment.task.random.seed(seeds.generate_state(8))
         self._suite_environment.reset()
-        self.num_episodes_started = episode + 1
+        self._next_episode = episode + 1
         self._reset_next_step = False
         self._current, self._frames = None, []
         return dm_env.restart(self._observe())
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
-        """Applies an action [A] in [-1, 1], or resets after an episode's end.
+        """Applies an action [A] in [-1, 1], or resets if the episode is over.
 
-        Returns:
-          Rewards of the repeats summed, discounts multiplied. The discount stays 1
-          where a time limit ends the episode.
-
-        Raises:
-          ValueError: `action` has another shape.
+        Over the action repeat rewards are summed and discounts multiplied; a time
+        limit leaves the discount at 1.
         """
         if self._reset_next_step:
             return self.reset()
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != self._action_spec.shape:
-            raise ValueError(
-                f"action has shape {action.shape}, expected {self._action_spec.shape}."
-            )
+        expected = self._action_spec.shape
+        if action.shape != expected:
+            raise ValueError(f"action has shape {action.shape}, expected {expected}.")
         control = self._action_low + (action + 1.0) * self._action_half_range
         reward, discount, is_last = 0.0, 1.0, False
         for _ in range(self._action_repeat):
@@ -141,16 +129,13 @@ class PixelEnvironment(dm_env.Environment):
         return self._observation_spec
 
     def single_observation(self) -> np.ndarray:
-        """Returns the present frame: uint8 [H, W, 3], or float32 [S] in state mode.
-
-        After `set_simulator_state` it shows the state that was set.
-        """
+        """Returns the current frame: uint8 [H, W, 3], or float32 [S] in state mode."""
         if self._current is None:
             self._current = self.renderer.render() if self._renders else self._state()
         return self._current.copy()
 
     def frame(self) -> np.ndarray:
-        """Returns the present image, uint8 [H, W, 3], also in state mode."""
+        """Returns the current image, uint8 [H, W, 3], also in state mode."""
         return self.single_observation() if self._renders else self.renderer.render()
 
     def simulator_state(self) -> dict[str, np.ndarray]:
@@ -164,24 +149,22 @@ class PixelEnvironment(dm_env.Environment):
     def set_simulator_state(
         self, qpos: np.ndarray, qvel: np.ndarray, act: np.ndarray
     ) -> None:
-        """Puts the simulation into a state from `simulator_state`.
+        """Sets the simulation to a state from `simulator_state`.
 
-        `frame` and `single_observation` show it at once; the stack keeps its images
-        until the next step. Touch and acceleration sensors, which depend on the
-        forces of the step before, are those of the state at rest from actuation.
+        `frame` and `single_observation` show it at once, the stack after the next step.
+        Touch and acceleration sensors, which depend on the previous step's forces, are
+        computed without actuation.
 
         Raises:
-          ValueError: an array has another shape than the model's.
+          ValueError: an array does not have the model's shape.
         """
         data = self.physics.data
         values = {"qpos": qpos, "qvel": qvel, "act": act}
         for name, value in values.items():
-            shape = getattr(data, name).shape
-            if np.shape(value) != shape:
-                raise ValueError(
-                    f"{name} has shape {np.shape(value)}, but {self._name} "
-                    f"needs {shape}."
-                )
+            given, shape = np.shape(value), getattr(data, name).shape
+            if given != shape:
+                what = f"{name} has shape {given}"
+                raise ValueError(f"{what}, but {self._name} needs {shape}.")
         with self.physics.reset_context():
             for name, value in values.items():
                 getattr(data, name)[:] = value
@@ -189,7 +172,7 @@ class PixelEnvironment(dm_env.Environment):
 
     @property
     def episode_steps(self) -> int | None:
-        """Agent steps of a whole episode; None where only the task ends it."""
+        """Agent steps of a whole episode; None without a time limit."""
         limit = self._suite_environment._step_limit
         return None if math.isinf(limit) else math.ceil(limit / self._action_repeat)
 

@@ -1,4 +1,4 @@
-"""Several environments side by side, each in a process that is replaced if it fails."""
+"""Environments in parallel processes, which are replaced if they fail."""
 
 import contextlib
 import multiprocessing
@@ -14,25 +14,26 @@ from typing import Any
 import numpy as np
 
 from jaxil.environments.interaction import Moment
+from jaxil.environments.player import InProcess
 
-# A step of the heaviest task takes a second in software; imports and the first image
-# take 5 s, on a crowded machine a minute.
+# In software the heaviest task takes a second per step; imports and the first image
+# take 5 s, or a minute on a busy machine.
 _STEP_SECONDS, _START_SECONDS = 60.0, 300.0
-_EXIT_SECONDS = 10.0  # that a killed process may take to disappear
+_EXIT_SECONDS = 10.0  # for a killed process to disappear
 _MAX_LOSSES = 3  # in a row, without a whole episode
 
 
 class EnvironmentsFailed(RuntimeError):
-    """Environments cannot continue; the message says why."""
+    """An environment raised an error, or keeps dying."""
 
 
 @contextlib.contextmanager
 def interrupts_blocked() -> Iterator[None]:
-    """Lets processes that are started meanwhile ignore Ctrl-C for their whole life.
+    """Makes processes that are started in this block ignore Ctrl-C.
 
-    A terminal sends it to all processes, and only the parent may act on it.
+    A terminal sends it to all processes, but only the parent may act on it.
     """
-    resource_tracker.ensure_running()  # where it starts, it would lift the block
+    resource_tracker.ensure_running()  # starting it later would lift the block
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -41,10 +42,10 @@ def interrupts_blocked() -> Iterator[None]:
 
 
 class Pool:
-    """Environments in separate processes, as `interaction.Environments`.
+    """Separate processes as `interaction.Environments`.
 
-    A process that dies or does not answer is killed and replaced when the next episode
-    starts. All of them end with this process, however that ends.
+    A process that dies or hangs is replaced when the next episode starts. All processes
+    end with the parent, even if that is killed.
     """
 
     def __init__(
@@ -59,12 +60,11 @@ class Pool:
         """Starts the processes without waiting for them.
 
         Args:
-          make: makes an `interaction.Environment`. It is pickled by name, and the
-            processes import what its module imports.
+          make: makes an `interaction.Environment`; pickled by name.
           size: number of environments.
-          say: takes a line for people when a process is replaced.
-          step_seconds: that a reset or a step may take.
-          start_seconds: the same for the first reset of a process.
+          say: receives a message when a process is replaced.
+          step_seconds: time limit of a reset or a step.
+          start_seconds: time limit of a process's first reset.
         """
         self.size = size
         self._make, self._say = make, say
@@ -81,29 +81,27 @@ class Pool:
 
     @property
     def pids(self) -> list[int]:
-        """The numbers of the live processes, by index."""
+        """Process ids, by index."""
         return [worker.process.pid or 0 for _, worker in sorted(self._workers.items())]
 
     def reset(self, index: int, episode: int) -> None:
-        """Sends an environment to an episode's start, in a new process if needed."""
+        """Starts an episode, in a new process if needed."""
         if index not in self._workers:
             self._say(
-                f"environment {index} {self._reasons[index]}: a new process replaces "
-                f"it and plays episode {episode} from its start"
+                f"environment {index} {self._reasons[index]}: a new process restarts "
+                f"episode {episode}"
             )
             self._workers[index] = _Worker(self._make)
         self._workers[index].send(("reset", episode))
 
     def step(self, index: int, action: np.ndarray) -> None:
-        """Sends an environment an action, shape [A]."""
+        """Sends an action, shape [A]."""
         self._workers[index].send(("step", action))
 
     def receive(self, index: int) -> Moment | None:
-        """Waits for the outcome of a reset or a step; None if the process was lost.
+        """Waits for the result; None if the process was lost.
 
-        Raises:
-          EnvironmentsFailed: the environment raised an error, or its process was lost
-            too many times in a row.
+        Raises EnvironmentsFailed for an error of the environment or repeated losses.
         """
         worker = self._workers[index]
         seconds = self._step_seconds if worker.has_answered else self._start_seconds
@@ -113,9 +111,7 @@ class Pool:
                 self._losses[index] = 0
             return answer
         if worker.has_raised:
-            raise EnvironmentsFailed(
-                f"environment {index} raised an error:\n{answer.rstrip()}"
-            )
+            raise EnvironmentsFailed(f"environment {index} raised an error:\n{answer}")
         self._workers.pop(index).close()
         self._reasons[index] = answer
         self._losses[index] += 1
@@ -134,13 +130,13 @@ class Pool:
 
 
 class _Worker:
-    """One process, as its parent sees it."""
+    """The parent's side of one process."""
 
     def __init__(self, make: Callable[[], Any]) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         with socket.socket(fileno=os.dup(self._pipe.fileno())) as ours:
-            # A process may also stop in the middle of an answer.
+            # A process may also hang in the middle of an answer.
             limit = struct.pack("ll", round(_STEP_SECONDS), 0)
             ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
         self.process = context.Process(target=_serve, args=(make, theirs), daemon=True)
@@ -148,14 +144,15 @@ class _Worker:
         with theirs, interrupts_blocked():
             self.process.start()
 
-    def send(self, order: tuple[str, Any]) -> None:
-        with contextlib.suppress(ConnectionError):  # `receive` tells
-            self._pipe.send(order)
+    def send(self, request: tuple[str, Any]) -> None:
+        with contextlib.suppress(ConnectionError):  # `receive` reports it
+            self._pipe.send(request)
 
     def receive(self, seconds: float) -> Moment | str:
-        """Returns the outcome; or why there is none, as the end of a sentence.
+        """Returns the result, or why there is none.
 
-        If `has_raised` is set afterwards, it is the environment's traceback instead.
+        After an error of the environment `has_raised` is set, and this is its
+        traceback.
         """
         try:
             if not self._pipe.poll(seconds):
@@ -173,34 +170,23 @@ class _Worker:
         return answer
 
     def close(self) -> None:
-        """Ends the process at once: it has nothing to save."""
+        """Kills the process, which has nothing to save."""
         self.process.kill()
         self.process.join(_EXIT_SECONDS)
         self._pipe.close()
 
 
 def _serve(make: Callable[[], Any], pipe: Any) -> None:
-    """Runs in the worker: obeys until the pipe ends, as it does with the parent."""
+    """Runs in the worker until the parent closes the pipe or ends."""
     with contextlib.suppress(EOFError, ConnectionError):
         try:
-            environment = make()
+            environment = InProcess(make())
             while True:
-                order, value = pipe.recv()
-                if order == "reset":
-                    timestep, reward, discount = (
-                        environment.reset(episode=value),
-                        0.0,
-                        1.0,
-                    )
-                else:
-                    timestep = environment.step(value)
-                    reward, discount = float(timestep.reward), float(timestep.discount)
-                frame = environment.single_observation()
-                seen, is_last = timestep.observation, timestep.last()
-                pipe.send(Moment(seen, frame, reward, discount, is_last))
+                method, value = pipe.recv()
+                getattr(environment, method)(0, value)
+                pipe.send(environment.receive(0))
         except (EOFError, ConnectionError):
             raise  # the parent is gone
         except Exception:
-            pipe.send(traceback.format_exc())
-    # At once: GL drivers have been seen to hang while they clean up.
-    os._exit(0)
+            pipe.send(traceback.format_exc().rstrip())
+    os._exit(0)  # without cleanup, in which GL drivers may hang

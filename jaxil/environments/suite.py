@@ -1,7 +1,7 @@
 """Makes environments of the DeepMind Control Suite.
 
-The only module that knows dm_control. Call `jaxil.machine.startup.prepare` first: the
-GL backend is chosen when dm_control is imported.
+No other module imports dm_control. Call `jaxil.machine.startup.prepare` first, because
+dm_control chooses the GL backend when it is imported.
 """
 
 import difflib
@@ -9,17 +9,15 @@ import functools
 import importlib.metadata
 from typing import Any
 
-from jaxil.environments.camera import Renderer
+from jaxil.environments.camera import RENDER_QUALITIES, Renderer
 from jaxil.environments.pixel_environment import PixelEnvironment
 
 OBSERVATIONS = ("pixels", "state")
-# Where camera 0 does not follow the body, DrQ-v2 takes another one.
-_CAMERAS = {"quadruped": 2}
 
 
 @functools.cache
 def known_tasks() -> tuple[str, ...]:
-    """Returns all tasks of the control suite, as `domain_task`, sorted."""
+    """Returns all tasks of the suite as `domain_task`, sorted."""
     from dm_control import suite
 
     return tuple(sorted(f"{domain}_{name}" for domain, name in suite.ALL_TASKS))
@@ -29,7 +27,7 @@ def split_task(task: str) -> tuple[str, str]:
     """Splits "ball_in_cup_catch" into ("ball_in_cup", "catch").
 
     Raises:
-      ValueError: no such task; names the closest ones.
+      ValueError: unknown task; names similar ones.
     """
     from dm_control import suite
 
@@ -41,28 +39,25 @@ def split_task(task: str) -> tuple[str, str]:
     advice = close or same_domain[:3] or ["cartpole_swingup", "walker_walk"]
     raise ValueError(
         f"task={task!r} is not a task of the control suite; write domain_task, "
-        f"such as {', '.join(advice)}."
+        f"for example {', '.join(advice)}."
     )
 
 
 def camera_of(task: str) -> int:
-    """Returns the index of the camera that the field uses for `task`.
-
-    Source: github.com/facebookresearch/drqv2, dmc.py: 2 for quadruped, else 0.
-    """
-    return _CAMERAS.get(split_task(task)[0], 0)
+    """Returns the index of the camera that DrQ-v2 uses (dmc.py)."""
+    return 2 if split_task(task)[0] == "quadruped" else 0
 
 
 @functools.cache
 def decision_seconds(task: str, action_repeat: int) -> float:
-    """Returns the simulated time between two decisions of the agent, in seconds."""
+    """Returns the simulated duration of an agent step, in seconds."""
     from dm_control import suite
 
     return suite.load(*split_task(task)).control_timestep() * action_repeat
 
 
 def simulator_versions() -> dict[str, str]:
-    """Returns the versions of the packages that physics and pixels depend on."""
+    """Returns the versions of the packages that determine physics and pixels."""
     return {
         "mujoco": importlib.metadata.version("mujoco"),
         "dm_control": importlib.metadata.version("dm-control"),
@@ -83,28 +78,28 @@ def make_environment(
 
     Args:
       task: one of `known_tasks()`.
-      seed: with an episode's number it fixes the episode's start. At least 0.
+      seed: determines, with an episode's number, its initial state. At least 0.
       action_repeat: environment frames per agent step.
       image_size: height and width in pixels.
-      frame_stack: images per observation; without effect on states.
+      frame_stack: images per observation; ignored for states.
       render_quality: "paper", "fast" or "smooth".
       observation: "pixels" or "state".
-
-    Raises:
-      ValueError: an argument is out of range.
     """
     for name, value, least in (
         ("seed", seed, 0),
         ("action_repeat", action_repeat, 1),
+        ("image_size", image_size, 1),
         ("frame_stack", frame_stack, 1),
     ):
         if value < least:
             raise ValueError(f"{name}={value} must be at least {least}.")
-    if observation not in OBSERVATIONS:
-        raise ValueError(
-            f"observation={observation!r} is unknown; choose one of: "
-            f"{', '.join(OBSERVATIONS)}."
-        )
+    for name, value, known in (
+        ("observation", observation, OBSERVATIONS),
+        ("render_quality", render_quality, RENDER_QUALITIES),
+    ):
+        if value not in known:
+            names = ", ".join(known)
+            raise ValueError(f"{name}={value!r} is unknown; choose one of: {names}.")
     from dm_control import suite
 
     domain, name = split_task(task)

@@ -1,4 +1,4 @@
-"""NumPy archives (.npz): read though they may be damaged or hostile, written whole."""
+"""Reads NumPy archives (.npz), even damaged or hostile ones; writes them atomically."""
 
 import errno
 import io
@@ -7,7 +7,6 @@ import os
 import pathlib
 import stat
 import struct
-import tempfile
 import warnings
 import zipfile
 import zlib
@@ -16,18 +15,15 @@ from typing import BinaryIO
 
 import numpy as np
 
+from jaxil.files import writing
+
 MAX_BYTES = 2 * 1024**3
-# What zipfile raises for damaged bytes.
-_DAMAGES = (
-    zipfile.BadZipFile,
-    zlib.error,
-    struct.error,
-    EOFError,
-    RuntimeError,  # encrypted; and NotImplementedError, such as a later version
-)
-# Most bytes that one compressed byte can stand for.
+# What zipfile raises on damage, encryption (RuntimeError) and unsupported features
+# (NotImplementedError, a RuntimeError).
+_DAMAGES = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError)
+# The highest compression ratio of each method.
 _MAX_RATIOS = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
-_MAX_HEADER_BYTES = 2**14  # of an .npy file; NumPy evaluates at most 10000
+_MAX_HEADER_BYTES = 2**14  # of an .npy file; NumPy itself stops at 10000
 _HEADER_READERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -35,11 +31,7 @@ _HEADER_READERS = {
 
 
 def open_regular(path: pathlib.Path) -> BinaryIO:
-    """Opens a regular file for reading; never waits for a pipe or reads a device.
-
-    Raises:
-      OSError: the file cannot be opened, or is not a regular file.
-    """
+    """Opens a file for reading; raises OSError for pipes and devices at once."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
@@ -48,7 +40,7 @@ def open_regular(path: pathlib.Path) -> BinaryIO:
 
 
 def member_names(path: pathlib.Path) -> frozenset[str]:
-    """Returns the names of an archive's arrays; none if it is not an archive."""
+    """Returns the names of an archive's arrays; empty for any other file."""
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
             names = archive.namelist()
@@ -60,20 +52,17 @@ def member_names(path: pathlib.Path) -> frozenset[str]:
 def read_archive(
     path: pathlib.Path, *, max_bytes: Mapping[str, int]
 ) -> dict[str, np.ndarray]:
-    """Reads arrays of an archive; never unpickles.
+    """Reads arrays of an archive without unpickling.
 
-    All sizes are checked, from the headers of the archive and of its arrays, before
-    anything is unpacked.
+    Sizes are checked in the headers of archive and arrays before anything is unpacked.
 
-    Args:
-      path: the file.
-      max_bytes: names of the arrays to read, each with its largest unpacked size. All
-        together may take as much as the largest of these limits.
+    `max_bytes` is the largest unpacked size of each array to read. The largest of these
+    limits also bounds their sum.
 
     Raises:
       OSError: the file cannot be opened, or is not a regular file.
-      ValueError: says what is wrong with the file, as the end of a sentence that begins
-        with its name.
+      ValueError: the file is damaged or too large; the message continues a sentence
+        that begins with the file's name.
     """
     budget, num_bytes = max(max_bytes.values(), default=0), 0
     with open_regular(path) as file:
@@ -91,17 +80,15 @@ def read_archive(
                 if num_bytes > budget:
                     raise ValueError(
                         f"has arrays of {num_bytes} bytes in all ({', '.join(members)})"
-                        f", more than the {budget} that are accepted"
+                        f", more than the {budget} allowed"
                     )
                 for name, info in members.items():
                     _check_header(archive, name, info)
                 return {name: _unpack(archive, info) for name, info in members.items()}
         except OSError as error:
-            if error.errno != errno.EINVAL:  # an offset before the file's beginning
+            if error.errno != errno.EINVAL:  # a seek to before the file's start
                 raise
-            raise ValueError(
-                "is cut off, damaged or no .npz file (a bad offset)"
-            ) from error
+            raise ValueError("is cut off, damaged or no .npz file") from error
         except _DAMAGES as error:
             raise ValueError(
                 f"is cut off, damaged or no .npz file ({error})"
@@ -112,13 +99,13 @@ def _check_size(name: str, info: zipfile.ZipInfo, limit: int, file_bytes: int) -
     if info.file_size > limit:
         raise ValueError(
             f"has an array {name} of {info.file_size} bytes, more than the {limit} "
-            "that are accepted"
+            "allowed"
         )
     if info.compress_type not in _MAX_RATIOS:
-        raise ValueError("is packed by a compression that is not read")
+        raise ValueError("uses an unsupported compression method")
     most_bytes = info.compress_size * _MAX_RATIOS[info.compress_type]
     if info.compress_size > file_bytes or info.file_size > most_bytes:
-        raise ValueError(f"has an array {name} that is not as long as it says")
+        raise ValueError(f"has an array {name} whose header claims a wrong length")
 
 
 def _check_header(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> None:
@@ -134,15 +121,13 @@ def _check_header(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) ->
         is_plain = dtype.itemsize and not dtype.fields and not dtype.subdtype
         if not is_plain or min(shape, default=0) < 0:
             raise ValueError(f"shape {shape} of {dtype}")
-    except (
-        Exception
-    ) as error:  # NumPy evaluates an expression, which may raise anything
+    except Exception as error:  # NumPy evaluates the header, which may raise anything
         reason = f"not the header of a plain array: {str(error)[:100]}"
         raise ValueError(f"has an unreadable array {name} ({reason})") from error
     if dtype.hasobject:
         raise ValueError(f"has an array {name} of Python objects, not of numbers")
     if start.tell() + math.prod(shape) * dtype.itemsize != info.file_size:
-        raise ValueError(f"has an array {name} that is not as long as it says")
+        raise ValueError(f"has an array {name} whose header claims a wrong length")
 
 
 def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
@@ -157,31 +142,13 @@ def write_archive(
     *,
     compressed: bool = True,
 ) -> None:
-    """Writes an archive under a temporary name, then renames it.
-
-    Args:
-      path: the file.
-      arrays: pairs of a name and an array; taken one at a time, so that they need not
-        all be in memory.
-      compressed: whether to spend time on a smaller file.
-
-    Raises:
-      OSError: the folder cannot be written.
-    """
+    """Writes named arrays atomically; only one at a time has to be in memory."""
     method = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, suffix=".part")
-    temporary = pathlib.Path(name)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            with zipfile.ZipFile(file, "w", method) as archive:
-                for name, array in arrays:
-                    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                        np.lib.format.write_array(member, array, allow_pickle=False)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.chmod(0o644)  # mkstemp's is for the owner only
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with (
+        writing.replacing(path) as temporary,
+        zipfile.ZipFile(temporary, "w", method) as archive,
+    ):
+        for name, array in arrays:
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)

@@ -1,4 +1,4 @@
-"""Locks that keep other processes away from a folder."""
+"""File locks between processes."""
 
 import contextlib
 import errno
@@ -10,25 +10,21 @@ import platform
 import time
 from collections.abc import Iterator
 
-# File systems that have no locks say so in one of these ways (NFS, Lustre).
+# Reported by file systems without locks (some NFS and Lustre mounts).
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
 class InUseError(Exception):
-    """Another process holds the lock; the message says which, if that is known."""
+    """Another process holds the lock."""
 
 
 @contextlib.contextmanager
 def locked(path: pathlib.Path) -> Iterator[None]:
-    """Holds the lock on a file, which is created if it is missing.
+    """Holds the lock on a file, creating the file if it is missing.
 
-    Where the file system has no locks, PATH.owner stands in: a file that only one
-    process can create, with host, process id and time. An owner that has ended on this
-    host is replaced.
-
-    Raises:
-      InUseError: another process holds it.
-      OSError: the file cannot be written.
+    Without file-system locks, PATH.owner replaces the lock: a file, created
+    exclusively, of host, process id and time. It is taken over if its process has ended
+    on this host. Raises InUseError if another process holds the lock.
     """
     with path.open("a") as file:
         try:
@@ -48,22 +44,7 @@ def locked(path: pathlib.Path) -> Iterator[None]:
         yield
 
 
-def is_locked(path: pathlib.Path) -> bool:
-    """Returns whether another process holds the lock on a file."""
-    try:
-        with path.open() as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError as error:
-        if error.errno in _NO_LOCKS:
-            return _owner(path.with_name(f"{path.name}.owner")) is not None
-        return not isinstance(error, FileNotFoundError)
-    return False
-
-
 def _own(path: pathlib.Path) -> None:
-    """Creates the file of an owner."""
     if _owner(path) is None:
         path.unlink(missing_ok=True)
     try:
@@ -77,14 +58,14 @@ def _own(path: pathlib.Path) -> None:
 
 
 def _owner(path: pathlib.Path) -> str | None:
-    """Returns who owns a file, in words; None if no process does any more."""
+    """Describes the owner; None if there is none, or if it has ended."""
     try:
         host, process, since = json.loads(path.read_text())
         if host == platform.node():
             os.kill(int(process), 0)
     except (FileNotFoundError, ProcessLookupError):
         return None
-    except PermissionError:  # it runs, and belongs to someone else
+    except PermissionError:  # running, as another user
         pass
     except (OSError, ValueError, TypeError, OverflowError, RecursionError):
         return "an unknown process"

@@ -1,4 +1,4 @@
-"""Nested settings by their dotted names."""
+"""Nested settings as flat dictionaries."""
 
 import json
 from collections.abc import Mapping
@@ -6,7 +6,7 @@ from typing import Any
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Returns the leaves of nested settings by dotted names, such as "encoder.mean"."""
+    """Returns the leaves of nested settings by dotted name ("sinkhorn.cost")."""
     leaves: dict[str, Any] = {}
     for name, value in tree.items():
         if isinstance(value, Mapping):
@@ -17,5 +17,5 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def as_stored(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns settings as a JSON file gives them back: tuples become lists."""
+    """Returns settings after a round trip through JSON: tuples become lists."""
     return json.loads(json.dumps(tree))

@@ -1,4 +1,4 @@
-"""Tables of numbers (CSV) that survive kills."""
+"""CSV tables of numbers that survive a kill in mid-write."""
 
 import csv
 import io
@@ -14,7 +14,7 @@ from jaxil.files import writing
 
 
 class CsvLog:
-    """A table with a column "frame", to which rows are appended."""
+    """An append-only table with a column "frame"."""
 
     def __init__(
         self,
@@ -24,24 +24,18 @@ class CsvLog:
         resume_frame: int | None = None,
         say: Callable[[str], None] = print,
     ):
-        """Writes the header, or on resume drops the rows that will be written again.
+        """Starts a new file, or with `resume_frame` continues the old one.
 
         Args:
-          path: the file. It is replaced unless `resume_frame` is given.
-          columns: names in their order.
-          resume_frame: rows of later frames are dropped, as is a last line that was
-            cut off. Columns that the file has and `columns` lacks are dropped too; new
-            ones are empty in old rows.
-          say: told if the old file is damaged, which is then kept under another name.
-
-        Raises:
-          ValueError: if "frame" is not among the columns.
-          OSError: if the file cannot be written.
+          path: the file.
+          columns: in order, "frame" among them. On resume, columns not listed are
+            dropped, and new ones are empty in old rows.
+          resume_frame: rows after this frame are dropped, as is an incomplete last
+            line.
+          say: told if the old file is damaged; that file is then renamed.
         """
         self._path = pathlib.Path(path)
         self._columns = tuple(columns)
-        if "frame" not in self._columns:
-            raise ValueError(f'columns = {self._columns}: expected "frame" among them')
         rows: list[dict[str, str]] = []
         if resume_frame is not None and self._path.exists():
             try:
@@ -55,14 +49,10 @@ class CsvLog:
         writing.write_atomically(self._path, self._format([header, *rows]))
 
     def append(self, row: Mapping[str, Any]) -> None:
-        """Adds one row, at once.
-
-        Args:
-          row: scalars by column; a column that is missing stays empty.
+        """Writes one row of scalars; missing columns stay empty.
 
         Raises:
-          ValueError: if the table has no such column.
-          OSError: if the row cannot be written.
+          ValueError: the table has no such column.
         """
         unknown = sorted(set(row) - set(self._columns))
         if unknown:
@@ -70,7 +60,7 @@ class CsvLog:
                 f"{self._path.name} has no column {', '.join(unknown)}: expected"
                 f" {', '.join(self._columns)}"
             )
-        # Opened each time, so that a table that has been deleted or moved is noticed.
+        # Reopened for each row, to notice that the table was deleted or moved.
         with self._path.open("r+b") as file:
             file.seek(0, os.SEEK_END)
             file.write(self._format([row]))
@@ -84,14 +74,12 @@ class CsvLog:
 
 
 def read_csv(path: str | os.PathLike) -> dict[str, np.ndarray]:
-    """Reads a table of numbers; a last line that was cut off is left out.
+    """Reads each column as float64, with NaN for empty cells.
 
-    Returns:
-      A float64 array for each column; empty cells are NaN.
+    An incomplete last line is left out.
 
     Raises:
-      OSError: if the file cannot be read.
-      ValueError: if it has no header with "frame", or a cell that is not a number.
+      ValueError: there is no header with "frame", or a cell is not a number.
     """
     columns, rows = _read(pathlib.Path(path))
     try:
@@ -104,10 +92,10 @@ def read_csv(path: str | os.PathLike) -> dict[str, np.ndarray]:
 
 
 def _read(path: pathlib.Path) -> tuple[list[str], list[dict[str, str]]]:
-    """Returns the columns, and the rows by column."""
+    """Returns the names of the columns, and the rows."""
     content = path.read_bytes()
     try:
-        # A row counts once its line has an end: a kill in mid-write leaves none.
+        # A kill in mid-write leaves a last line without an end.
         text = content[: content.rfind(b"\n") + 1].decode()
         columns, *rows = [*csv.reader(io.StringIO(text))] or [[]]
         table = [dict(zip(columns, row, strict=True)) for row in rows if row]
@@ -119,7 +107,7 @@ def _read(path: pathlib.Path) -> tuple[list[str], list[dict[str, str]]]:
 
 
 def _set_aside(path: pathlib.Path) -> pathlib.Path:
-    """Renames a file to a free name, PATH.damaged or PATH.damaged2 and so on."""
+    """Renames a file to PATH.damaged, or to PATH.damaged2, ..."""
     aside, again = path.with_name(f"{path.name}.damaged"), 1
     while aside.exists():
         again += 1
@@ -128,5 +116,5 @@ def _set_aside(path: pathlib.Path) -> pathlib.Path:
 
 
 def _cell(value: Any) -> str:
-    """Writes a scalar with the fewest digits that give it back exactly in its dtype."""
+    """Formats a scalar with the fewest digits that restore it exactly in its dtype."""
     return value if isinstance(value, str) else str(np.asarray(value)[()])

@@ -1,4 +1,4 @@
-"""Other people's files: which ones are opened, and how their text is printed."""
+"""Untrusted files: what may be opened, and how their text is printed."""
 
 import os
 import pathlib
@@ -6,18 +6,15 @@ import stat
 
 
 def require_regular(path: str | os.PathLike, *, or_folder: bool = False) -> None:
-    """Raises ValueError for what must not be opened: pipes, devices, sockets.
-
-    Opening one could wait forever or fill the memory.
+    """Rejects pipes, devices and sockets, which could block or never end.
 
     Raises:
-      ValueError: the end of a sentence that begins with the file's name.
-      OSError: there is no such file.
+      ValueError: not a regular file; continues a sentence that begins with its name.
     """
     mode = pathlib.Path(path).stat().st_mode
     if not stat.S_ISREG(mode) and not (or_folder and stat.S_ISDIR(mode)):
         kind = "folder" if stat.S_ISDIR(mode) else "pipe, device or socket"
-        raise ValueError(f"is a {kind}, where a regular file is expected")
+        raise ValueError(f"is a {kind}, not a regular file")
 
 
 def printable(text: object, max_letters: int = 1000) -> str:

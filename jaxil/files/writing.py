@@ -1,4 +1,4 @@
-"""Files and folders that are replaced as a whole: at any kill, the old or the new."""
+"""Atomic replacement of files and folders: a kill leaves the old or the new one."""
 
 import contextlib
 import os
@@ -9,7 +9,7 @@ import time
 import uuid
 from collections.abc import Iterator
 
-# Also the names that earlier versions gave to what they had not finished.
+# Temporary names of this and earlier versions.
 _TEMPORARY = re.compile(
     r"\.tmp-.*|\.(saving|deleting|writing)_.*|\..*\.tmp(\.mp4)?|config\.json\.\d+\.tmp"
 )
@@ -17,12 +17,12 @@ _TEMPORARY = re.compile(
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike) -> Iterator[pathlib.Path]:
-    """Yields a temporary path; what the block writes there then becomes `path`.
+    """Yields a temporary path with the same suffix, which then replaces `path`.
 
-    The temporary name has the ending of `path`. If the block fails, it is removed.
+    If the block fails, what it wrote is removed.
     """
     path = pathlib.Path(path)
-    # A name has at most 255 bytes, so not all of a long one fits.
+    # File names are limited to 255 bytes.
     temporary = path.with_name(f".tmp-{uuid.uuid4().hex[:12]}-{path.name[-32:]}")
     try:
         yield temporary
@@ -35,13 +35,13 @@ def replacing(path: str | os.PathLike) -> Iterator[pathlib.Path]:
 
 
 def write_atomically(path: str | os.PathLike, content: bytes) -> None:
-    """Replaces a file as a whole."""
+    """Writes a file, replacing an old one atomically."""
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
 
 def remove(path: pathlib.Path) -> None:
-    """Removes a file, or a folder with all that is in it, if it exists."""
+    """Removes a file or a whole folder, if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -49,17 +49,14 @@ def remove(path: pathlib.Path) -> None:
 
 
 def remove_leftovers(folder: pathlib.Path, *, min_age_seconds: float = 0.0) -> None:
-    """Removes what killed processes left unfinished in a folder, if it exists.
+    """Removes temporary files of killed processes from a folder, not its subfolders.
 
-    Args:
-      folder: its subfolders are not searched.
-      min_age_seconds: spares files that another process may be writing now.
+    Younger ones than `min_age_seconds` stay: another process may be writing them.
     """
     if not folder.is_dir():
         return
     for path in folder.iterdir():
         if _TEMPORARY.fullmatch(path.name):
-            # Another process may have removed it in the meantime.
-            with contextlib.suppress(FileNotFoundError):
+            with contextlib.suppress(FileNotFoundError):  # by another process
                 if time.time() - path.lstat().st_mtime >= min_age_seconds:
                     remove(path)

@@ -1,25 +1,26 @@
-"""Stacks of frames, put together on the device from the frames that lie there."""
+"""Learning steps that assemble stacks of frames from a device copy."""
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
-from jax import Array
 
 from jaxil.learner.state import TrainState
+from jaxil.maths.stacking import gather_stacks
 from jaxil.maths.types import Batch, Data, ExpertBatch, Metrics
 
 Step = Callable[..., tuple[TrainState, Metrics]]
 
 
 class Frames(NamedTuple):
-    """All frames that batches are drawn from, on the device.
+    """All frames that batches are sampled from, on the device.
 
     Attributes:
-      agent: those of the replay, uint8 [N, H, W, 3] or float32 [N, S]; None for a
-        method that plays no episodes.
+      agent: the replay's, uint8 [N, H, W, 3] or float32 [N, S]; None for a method
+        that plays no episodes.
       expert: the demonstrations', uint8 [K, M, H, W, 3] or float32 [K, M, S]; None
         for a method that samples none.
     """
@@ -28,74 +29,36 @@ class Frames(NamedTuple):
     expert: Data | None
 
 
-def gather_stacks(frames: Data, slots: Data) -> Array:
-    """Gathers frames and folds each stack of them into the channels.
-
-    Args:
-      frames: shape [N, H, W, C], or [N, S] if F is 1.
-      slots: int32 [..., F] in [0, N): the frames of each stack, the oldest first.
-
-    Returns:
-      Shape [..., H, W, F * C], or [..., S].
-    """
-    chex.assert_rank(frames, {2, 4})
-    gathered = jnp.asarray(frames).at[slots].get(mode="promise_in_bounds")
-    if frames.ndim == 2:
-        chex.assert_axis_dimension(slots, -1, 1)
-        return jnp.squeeze(gathered, -2)
-    # [..., F, H, W, C] to [..., H, W, F, C], whose last two axes are the channels.
-    gathered = jnp.moveaxis(gathered, -4, -2)
-    return gathered.reshape(*gathered.shape[:-2], -1)
-
-
 def gather_batch(frames: Data, batch: Batch) -> Batch:
-    """Puts pixels in the place of slots.
-
-    Args:
-      frames: see `gather_stacks`.
-      batch: as the replay's `sample_indices` draws it: observations int32 [B, F], those
-        of a window [B, n, F].
-    """
-    window = batch.window
-    if window is not None:
-        window = window._replace(observation=gather_stacks(frames, window.observation))
-    successor = batch.successor
-    if successor is not None:
-        successor = gather_stacks(frames, successor)
-    return batch._replace(
-        observation=gather_stacks(frames, batch.observation),
-        next_observation=gather_stacks(frames, batch.next_observation),
-        successor=successor,
-        window=window,
-    )
+    """Replaces the frame indices of a batch from `Replay.sample_indices` by stacks."""
+    return batch.map_observations(functools.partial(gather_stacks, frames))
 
 
 def gather_expert(frames: Data, expert: ExpertBatch) -> ExpertBatch:
-    """Puts pixels in the place of slots.
+    """Replaces frame indices by stacks.
 
     Args:
-      frames: of whole episodes, see `Frames.expert`.
-      expert: observations int32 [B, F], places in the episodes laid end to end.
+      frames: see `Frames.expert`.
+      expert: its observations, int32 [B, F], index the concatenated episodes.
     """
     chex.assert_rank(frames, {3, 5})
-    row = jnp.asarray(frames).reshape(-1, *frames.shape[2:])
+    flat = jnp.asarray(frames).reshape(-1, *frames.shape[2:])
     successor = expert.successor
     if successor is not None:
-        successor = gather_stacks(row, successor)
+        successor = gather_stacks(flat, successor)
     return expert._replace(
-        observation=gather_stacks(row, expert.observation), successor=successor
+        observation=gather_stacks(flat, expert.observation), successor=successor
     )
 
 
 def make_gathering_step(step: Step) -> Step:
-    """Returns a learning step that may be told where the frames lie.
+    """Returns a step that takes frame indices if it is given the frames.
 
-    (state, batch, expert, frames) -> (state, metrics). With frames, batches hold slots
-    in the place of pixels, see `gather_batch` and `gather_expert`; without, they are
-    those that `step` takes.
+    (state, batch, expert, frames) -> (state, metrics). With frames, batches hold
+    indices instead of pixels, see `gather_batch` and `gather_expert`.
 
     Args:
-      step: the learning step, (state, batch, expert) -> (state, metrics).
+      step: (state, batch, expert) -> (state, metrics).
     """
 
     def gathering_step(
@@ -109,8 +72,8 @@ def make_gathering_step(step: Step) -> Step:
         if frames is not None and expert is not None:
             expert = gather_expert(frames.expert, expert)
         if frames is not None:
-            # Without it, XLA may fuse what follows with the gathering, sum in another
-            # order, and where frames lie would change the numbers of a run.
+            # Otherwise XLA may fuse the gathering with what follows and sum in another
+            # order: a device copy would change the results of a run.
             batch, expert = jax.lax.optimization_barrier((batch, expert))
         return step(state, batch, expert)
 
@@ -120,11 +83,10 @@ def make_gathering_step(step: Step) -> Step:
 def make_repeated_step(step: Step) -> Step:
     """Returns a step that makes n updates in one call.
 
-    Its batches have one axis more, of length n, in front; its metrics are those of the
-    last update.
+    Its batches have a leading axis of length n; its metrics are the last update's.
 
     Args:
-      step: as `make_gathering_step` returns it.
+      step: from `make_gathering_step`.
     """
 
     def repeated_step(
@@ -133,8 +95,8 @@ def make_repeated_step(step: Step) -> Step:
         expert: ExpertBatch | None,
         frames: Frames | None = None,
     ) -> tuple[TrainState, Metrics]:
-        def update(state: TrainState, drawn: tuple) -> tuple[TrainState, Metrics]:
-            return step(state, *drawn, frames)
+        def update(state: TrainState, batches: tuple) -> tuple[TrainState, Metrics]:
+            return step(state, *batches, frames)
 
         state, metrics = jax.lax.scan(update, state, (batch, expert))
         return state, jax.tree.map(lambda values: values[-1], metrics)

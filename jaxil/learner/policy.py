@@ -23,7 +23,7 @@ def make_sample_action(
 
     (encoder params, actor params, observations [E, H, W, C], key, num_steps [E]) ->
     actions [E, A]. `num_steps` counts agent steps: it sets the noise's size and, with
-    the run's base key, its draw. Noise is clipped in updates only, not here.
+    the run's base key, the noise itself, which is clipped in updates only, not here.
 
     Args:
       networks: the agent's.

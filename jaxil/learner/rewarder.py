@@ -126,7 +126,8 @@ class Rewarder(NamedTuple):
       rewards_changed: state -> whether an episode rewarded before the last `observe`
         would get other rewards now. None where stored rewards never change.
       actor_loss: (state, learner, agent, expert, key) -> scalar, added to the actor's
-        loss; `learner.actor` is what it is differentiated for. None without.
+        loss and differentiated for `learner.actor`; the other networks of `learner`
+        have made this update's step. None without.
       plan: (state, learner, episode, expert_episodes) -> the transport plan
         [T + 1, N + 1] behind `rewards`, to look at; None without one.
       summary: state -> scalars worth logging after an episode.

@@ -68,7 +68,7 @@ def init_train_state(
       spec: sizes.
     """
     networks = learner.networks
-    # Numbers below zero never meet update numbers, so no draw is used twice.
+    # Beyond all update numbers, so no random number is used twice.
     encoder_key, actor_key, critic_key, rewarder_key = jax.random.split(
         jax.random.fold_in(key, 2**32 - 1), 4
     )
@@ -94,10 +94,9 @@ def init_train_state(
 def make_update_step(learner: Learner) -> UpdateStep:
     """Returns the learning step, to be jitted with its state donated.
 
-    The order is that of the reference: rewards, where they are not stored; augment;
-    rewarder on pre-update features;
-    critic, which alone trains the encoder; actor with the updated critic on the
-    pre-update representation; target critic last.
+    The order is that of the reference: relabel, if the method does; augment; rewarder
+    on pre-update features; critic, which alone trains the encoder; actor with the
+    updated critic on the pre-update representation; target critic last.
     """
 
     def update_step(
@@ -159,7 +158,7 @@ def _with_successors(
 ) -> AgentView:
     """Adds augmented successors, and their features without gradient."""
     assert batch.successor is not None
-    # A draw of its own, so that methods without successors keep theirs.
+    # A key of its own, so that the other random numbers stay as they are without.
     successor = _augment(learner, batch.successor, jax.random.fold_in(key, 1))
     features = critic_features(
         learner.networks, before.encoder, before.critic, successor
@@ -176,7 +175,7 @@ def _augment(learner: Learner, observation: Array, key: Array) -> Array:
 def _update_critic(
     learner: Learner, state: TrainState, batch: Batch, std: Array, key: Array
 ) -> tuple[TrainState, Array, Array, Metrics]:
-    """Steps critic and encoder; returns their pre-update outputs as well.
+    """Steps critic and encoder; also returns their pre-update outputs.
 
     Returns:
       The state, the representation [B, R] and the critic's features [B, D] of the

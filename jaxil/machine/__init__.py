@@ -1,1 +1,1 @@
-"""The machine: start-up, caches, signals, progress."""
+"""The machine: start-up, devices, child processes, signals, progress."""

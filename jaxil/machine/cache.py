@@ -1,4 +1,4 @@
-"""Where this machine keeps what can be computed again."""
+"""Folders of cached files."""
 
 import hashlib
 import os
@@ -17,6 +17,6 @@ def cache_folder() -> pathlib.Path:
 
 
 def compilation_folder() -> pathlib.Path:
-    """Returns the folder of compiled programs for this processor and this jaxlib."""
+    """Returns the folder of programs compiled for this processor and jaxlib."""
     digest = hashlib.sha256(devices.instruction_set().encode()).hexdigest()[:8]
     return cache_folder() / f"compiled-{devices.version('jaxlib')}-{digest}"

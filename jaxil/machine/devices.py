@@ -1,6 +1,6 @@
-"""Processor and accelerator: what is there, what jax computes on, its memory.
+"""Processor, accelerator and its memory.
 
-Only functions that ask jax import it, so that start-up can use the others first.
+jax is imported inside functions, so that start-up can use the others before it.
 """
 
 import glob
@@ -13,7 +13,7 @@ from typing import Any
 
 
 def has_cuda_device() -> bool:
-    """Returns whether there is an NVIDIA device that is not hidden from CUDA."""
+    """Returns whether CUDA can see an NVIDIA device."""
     if os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1"):
         return False
     return bool(glob.glob("/dev/nvidia[0-9]*")) or os.path.exists("/dev/dxg")
@@ -33,7 +33,7 @@ def uses_cpu() -> bool:
 
 
 def version(package: str) -> str | None:
-    """Returns the installed version of a package, None without it."""
+    """Returns the installed version of a package, or None."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -41,10 +41,10 @@ def version(package: str) -> str | None:
 
 
 def instruction_set() -> str:
-    """Returns what decides which machine code runs here: the CPU's model and features.
+    """Returns the CPU's model and features.
 
-    Home folders are shared between machines; code that was compiled for one processor
-    may contain instructions that another lacks.
+    Home folders are shared between machines, and code compiled for one processor may
+    contain instructions that another lacks.
     """
     return "\n".join(
         sorted({s for s in _cpuinfo() if s.startswith(("model name", "flags"))})
@@ -60,10 +60,7 @@ def device_name() -> str:
 
 
 def free_bytes() -> int | None:
-    """Returns what jax may still allocate on its device; None where unknown.
-
-    Unknown for CPUs too, whose memory is the host's.
-    """
+    """Returns what jax may still allocate on its device; None for CPUs."""
     statistics = _memory_statistics()
     if "bytes_limit" not in statistics:
         return None
@@ -71,12 +68,12 @@ def free_bytes() -> int | None:
 
 
 def peak_bytes() -> int | None:
-    """Returns the most that jax has allocated on its device; None where unknown."""
+    """Returns the peak of jax's allocations on its device; None if unknown."""
     return _memory_statistics().get("peak_bytes_in_use")
 
 
 def describe() -> dict[str, Any]:
-    """Returns what a measurement was made on."""
+    """Returns a description of the device and machine."""
     import jax
 
     processors = (s.split(":")[1].strip() for s in _cpuinfo() if "model name" in s)

@@ -1,19 +1,16 @@
-"""How much of the host's memory this process may still use."""
+"""The host's memory: what is available, and what this process has used."""
 
 import pathlib
 import resource
 
-_ASSUMED_BYTES = 4 * 2**30  # where the machine does not tell
+_ASSUMED_BYTES = 4 * 2**30  # if unknown
 
 
 def available_bytes(root: pathlib.Path = pathlib.Path("/")) -> int | None:
-    """Returns the memory that this process may still allocate, None where unknown.
+    """Returns the memory that this process may still allocate, None if unknown.
 
-    The smaller of what the machine has free and what its control groups (the limit of
-    a container or a batch job) leave; file caches count as free.
-
-    Args:
-      root: where /proc and /sys are; for tests.
+    The minimum of the machine's free memory and what control groups (of a container or
+    a batch job) allow. File caches count as free. `root` is for tests.
     """
     meminfo = _read_fields(root / "proc/meminfo")
     bounds = [1024 * meminfo[name] for name in ("MemAvailable",) if name in meminfo]
@@ -33,19 +30,19 @@ def available_bytes(root: pathlib.Path = pathlib.Path("/")) -> int | None:
 def spare_bytes() -> int:
     """Returns how much memory demonstrations may use: half of what is available.
 
-    In whole GiB, so that a file that is read twice is read under the same limit.
+    In whole GiB, so that the limit is the same when a file is read again.
     """
     available = available_bytes() or _ASSUMED_BYTES
     return max(available // 2 // 2**30, 1) * 2**30
 
 
 def peak_bytes() -> int:
-    """Returns the most memory that this process has occupied so far."""
+    """Returns the peak memory of this process."""
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def _control_groups(root: pathlib.Path) -> list[pathlib.Path]:
-    """Returns the folders of this process's control groups and of their parents."""
+    """Returns the folders of this process's control groups and their parents."""
     try:
         lines = (root / "proc/self/cgroup").read_text().splitlines()
     except OSError:
@@ -72,7 +69,7 @@ def _read_fields(path: pathlib.Path) -> dict[str, int]:
 
 
 def _read_number(path: pathlib.Path) -> int | None:
-    """Reads a file of one number; None where it is missing or says "max"."""
+    """Reads a number from a file; None if it is missing or says "max"."""
     try:
         return int(path.read_text())
     except (OSError, ValueError):

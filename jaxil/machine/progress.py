@@ -1,4 +1,4 @@
-"""The one live line of whatever takes long: how far, how fast, how long still."""
+"""A progress line: position, speed and time left."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -6,13 +6,13 @@ from typing import TextIO
 
 from jaxil.machine.screen import LastingStream
 
-_TTY_SECONDS = 0.2  # between two updates of a terminal's line, and of the speed
-_PLAIN_SECONDS = 30.0  # between two lines in a log file
-_WINDOW_SECONDS = 60.0  # that the speed is measured over
+_TTY_SECONDS = 0.2  # between updates of a terminal's line, and of the speed
+_PLAIN_SECONDS = 30.0  # between lines in a log file
+_WINDOW_SECONDS = 60.0  # over which the speed is measured
 
 
 class ProgressLine:
-    """Shows one line on stderr: live in a terminal, else a new one now and then."""
+    """Shows a line on stderr: live in a terminal, else a new line every 30 s."""
 
     def __init__(
         self,
@@ -27,14 +27,14 @@ class ProgressLine:
         """Starts the clock.
 
         Args:
-          total_frames: environment frames at the run's end, >= 1.
-          first_frame: frame at which this process starts (not 0 after a resume).
-          label: a few words for the line's beginning.
+          total_frames: environment frames at the end, >= 1.
+          first_frame: where this process starts; not 0 after a resume.
+          label: starts the line.
           unit: what is counted, if not environment frames.
-          stream: where to write; stderr when None.
-          clock: seconds from any origin, for tests.
+          stream: None for stderr.
+          clock: in seconds, for tests.
         """
-        # Imported here: commands that only write time spans need none of it.
+        # Imported here, since `duration` does not need it.
         from rich import console, progress
 
         self._stream = LastingStream(stream)
@@ -44,7 +44,7 @@ class ProgressLine:
             highlight=False,
         )
         self._live = screen.is_terminal and not screen.is_dumb_terminal
-        # rich measures the speed, also where nothing is shown by it.
+        # rich also measures the speed if the line is not live.
         self._progress = progress.Progress(
             progress.TextColumn("{task.description}", markup=False),
             console=screen,
@@ -61,7 +61,7 @@ class ProgressLine:
         self._next_update = self._began
         self._next_line = self._began + _PLAIN_SECONDS / 10
         self._task = self._progress.add_task("", total=total_frames)
-        # The first sample only says where and when the others begin.
+        # The first sample marks the start; rich ignores samples of 0.
         self._progress.update(self._task, completed=max(first_frame, 1e-9))
 
     def update(
@@ -70,13 +70,12 @@ class ProgressLine:
         seconds: Mapping[str, float],
         returns: Mapping[str, float] | None = None,
     ) -> None:
-        """Says where the run stands; cheap to call at every step.
+        """Shows the progress; cheap enough for every step.
 
         Args:
           frame: environment frames so far.
-          seconds: this process's seconds so far by name, e.g. environment, update; the
-            remainder of its time is shown as the rest.
-          returns: last returns by name, e.g. task, imitation, evaluation.
+          seconds: spent so far by activity; what is missing is shown as "rest".
+          returns: last returns by name.
         """
         now = self._clock()
         if now < self._next_update:
@@ -84,7 +83,10 @@ class ProgressLine:
         self._next_update = now + _TTY_SECONDS
         self._progress.update(self._task, completed=frame)
         if self._live:
-            self._start()
+            if not self._progress.live.is_started:
+                self._progress.start()
+                # A killed run would leave it hidden.
+                self._progress.console.show_cursor(True)
             line = self._line(now, seconds, returns or {})
             self._progress.update(self._task, description=line, refresh=True)
         elif now >= self._next_line:
@@ -92,21 +94,15 @@ class ProgressLine:
             self.message(self._line(now, seconds, returns or {}))
 
     def message(self, text: str) -> None:
-        """Writes a lasting line, above the live one."""
+        """Writes a permanent line, above the live one."""
         if self._live:
             self._progress.console.print(text, markup=False, soft_wrap=True)
         else:
             self._stream.write(f"{text}\n")
 
     def close(self) -> None:
-        """Leaves the live line as it is, and goes to the next."""
+        """Ends the live line."""
         self._progress.stop()
-
-    def _start(self) -> None:
-        if not self._progress.live.is_started:
-            self._progress.start()
-            # A run that is killed could not bring it back.
-            self._progress.console.show_cursor(True)
 
     def _line(
         self, now: float, seconds: Mapping[str, float], returns: Mapping[str, float]
@@ -132,7 +128,7 @@ class ProgressLine:
 
 
 def duration(seconds: float) -> str:
-    """Writes a time span for people: 42 s, 12 min, 3 h 05 min, 2 d 04 h."""
+    """Formats a duration: 42 s, 12 min, 3 h 05 min, 2 d 04 h."""
     seconds = max(seconds, 0.0)
     if seconds < 59.5:
         return f"{seconds:.0f} s"

@@ -1,4 +1,4 @@
-"""What a run's config.json says about the machine and its software."""
+"""The machine and its software, for a run's config.json."""
 
 import importlib.metadata
 import platform
@@ -13,12 +13,7 @@ _PACKAGES = (
 
 
 def describe(gl_name: str, *, native: bool) -> dict[str, Any]:
-    """Returns versions, device, form of the convolutions and renderer.
-
-    Args:
-      gl_name: the renderer's name for itself.
-      native: whether the encoder in C is used.
-    """
+    """Returns versions, device, convolutions ("native" for those in C) and renderer."""
     return {
         "versions": {
             "python": platform.python_version(),

@@ -1,4 +1,4 @@
-"""Lines for people, which never end a run: its terminal or pipe may close."""
+"""Output to the user that does not end a run if its terminal or pipe closes."""
 
 import os
 import sys
@@ -6,17 +6,17 @@ from typing import TextIO
 
 
 class LastingStream:
-    """A text stream that goes quiet, instead of failing, once it is closed.
+    """A text stream that discards its input, instead of failing, once it is closed.
 
-    So `jaxil.launch ... 2>&1 | head` trains on after `head` has ended.
+    With it, `jaxil.launch ... 2>&1 | head` keeps training after `head` has ended.
     """
 
     def __init__(self, stream: TextIO | None = None) -> None:
-        """Writes to `stream`; None stands for stderr, whatever that is at the time."""
+        """Writes to `stream`, or if None to the current sys.stderr."""
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """Writes text out at once."""
+        """Writes and flushes text."""
         stream = self._stream or sys.stderr
         try:
             stream.write(text)
@@ -26,7 +26,7 @@ class LastingStream:
         return len(text)
 
     def flush(self) -> None:
-        """Does nothing: `write` has done it."""
+        """Does nothing, since `write` flushes."""
 
     def isatty(self) -> bool:
         """Returns whether it is a terminal."""
@@ -42,7 +42,7 @@ def say(text: str) -> None:
 
 
 def _give_up(stream: TextIO | None) -> None:
-    """Sends what a stream still holds, and all that others write there, nowhere."""
+    """Redirects a stream, its buffer included, to /dev/null."""
     try:
         descriptor = stream.fileno()  # pyright: ignore[reportOptionalMemberAccess]
     except (OSError, ValueError, AttributeError):

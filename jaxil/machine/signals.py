@@ -1,4 +1,4 @@
-"""Stopping a run from outside, without losing what it has done."""
+"""Signals that stop a run, which saves first."""
 
 import signal
 from collections.abc import Callable
@@ -12,18 +12,18 @@ _NAMES = {
 
 
 class StopOnSignals:
-    """Turns the first signal into a request to stop, another into an end at once.
+    """Makes the first signal a request to stop, and the second end the process.
 
-    Another SIGHUP is ignored: shell and kernel may each send one for one terminal. And
-    under `nohup`, which ignores the signal, all are.
+    A second SIGHUP is ignored, since shell and kernel may each send one. Under `nohup`
+    all of them are ignored.
     """
 
     def __init__(self, ask: Callable[[str], bool]) -> None:
-        """Takes what is told the signal's name, and returns whether it is the first."""
+        """Takes a function from a signal's name to whether it is the first."""
         self._ask = ask
 
     def __enter__(self) -> None:
-        """Takes over the signals."""
+        """Installs the handlers."""
         self._before = {
             number: signal.signal(number, self._handle)
             for number in _NAMES
@@ -31,7 +31,7 @@ class StopOnSignals:
         }
 
     def __exit__(self, *_: Any) -> None:
-        """Gives them back."""
+        """Restores the previous handlers."""
         for number, handler in self._before.items():
             signal.signal(number, handler)
 

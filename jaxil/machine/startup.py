@@ -1,7 +1,7 @@
-"""What has to be set before jax and mujoco are imported: GL, XLA flags, malloc.
+"""Settings before jax and mujoco are imported: GL, XLA flags, malloc.
 
-Both read their settings once, so every command calls `prepare` before it imports
-either. What the user has set stays as it is.
+Both read their settings once, so commands call `prepare` before they import either.
+What the user has set is not changed.
 """
 
 import ctypes
@@ -12,16 +12,16 @@ import sys
 from jaxil.machine import devices
 from jaxil.machine.cache import compilation_folder
 
-# These jaxlibs hand convolutions to YNNPACK, which takes 4 to 5 times as long for
-# those whose result is kept, as in training. An unknown flag aborts the process, so
-# only versions known to accept it get it.
+# These jaxlibs pass convolutions to YNNPACK, which takes 4 to 5 times as long for those
+# whose output is kept, as in training. XLA aborts on unknown flags, so this lists only
+# versions that are known to accept this one.
 _JAXLIBS_WITH_YNN_FUSION = ("0.10.2",)
 _NO_YNN_FUSION = "--xla_cpu_experimental_ynn_fusion_type="
 
 # What apt-get installs on Debian and Ubuntu for GL without a screen.
 GL_PACKAGES = ("libegl1", "libgl1-mesa-dri", "libosmesa6")
-# That a library loads proves little: EGL does so without a driver. So make a context,
-# in a separate process because a process can choose only once.
+# EGL loads even without a driver, so the probe creates a context. It is a separate
+# process because the choice of a backend is final.
 _GL_PROBE = """
 import os
 import dm_control._render as render
@@ -31,15 +31,15 @@ with context.make_current() as current:
 os._exit(0)
 """
 _GL_PROBE_SECONDS = 15.0
-_GL_PROBE_TRIES = 2  # drivers have been seen to hang, once in hundreds of tries
-# Options of glibc's malloc.h that keep freed memory in the process: blocks of any size
-# come from one heap, which is never trimmed.
+_GL_PROBE_TRIES = 2  # some drivers hang once in hundreds of tries
+# Options of glibc's malloc.h that keep freed memory in the process: all blocks come
+# from one heap, which is never trimmed.
 _MALLOC_SETTINGS = (
     (-8, 1),  # M_ARENA_MAX
     (-4, 0),  # M_MMAP_MAX
-    (-1, -1),  # M_TRIM_THRESHOLD: the greatest there is
+    (-1, -1),  # M_TRIM_THRESHOLD: the maximum
 )
-_MALLOC_VARIABLES = ("GLIBC_TUNABLES", "MALLOC_")  # how their names begin
+_MALLOC_VARIABLES = ("GLIBC_TUNABLES", "MALLOC_")  # prefixes of names
 
 
 def prepare() -> str:
@@ -47,10 +47,7 @@ def prepare() -> str:
 
     Sets environment variables that the user has not set: `MUJOCO_GL`, `XLA_FLAGS`
     (appended to), `TF_CPP_MIN_LOG_LEVEL` and those of jax's persistent compilation
-    cache. A second call changes nothing.
-
-    Returns:
-      One line that says what is in force.
+    cache. A second call changes nothing. Returns a line that describes the settings.
     """
     cpu = devices.uses_cpu()
     if cpu:
@@ -72,7 +69,7 @@ def prepare() -> str:
 
 
 def gl_works(backend: str) -> bool:
-    """Returns whether `backend` ("egl", "osmesa") can make a context here."""
+    """Returns whether `backend` ("egl", "osmesa") can create a context here."""
     environment = {**os.environ, "MUJOCO_GL": backend}
     environment.pop("PYOPENGL_PLATFORM", None)
     for _ in range(_GL_PROBE_TRIES):
@@ -92,7 +89,7 @@ def gl_works(backend: str) -> bool:
 
 
 def _choose_gl() -> str:
-    """Sets MUJOCO_GL where it is unset; returns a few words about it."""
+    """Sets MUJOCO_GL if it is unset; returns a few words about it."""
     chosen = os.environ.get("MUJOCO_GL")
     if chosen is not None:
         return f"GL {chosen or 'glfw'} (MUJOCO_GL)"
@@ -100,7 +97,7 @@ def _choose_gl() -> str:
         if gl_works(backend):
             os.environ["MUJOCO_GL"] = backend
             return f"GL {backend}"
-    # If unset, dm_control would try to open a window and fail with an unclear message.
+    # Otherwise dm_control would try to open a window and fail with an unclear message.
     os.environ["MUJOCO_GL"] = "disable"
     return f"no GL: `apt-get install {' '.join(GL_PACKAGES)}` installs it"
 
@@ -108,9 +105,9 @@ def _choose_gl() -> str:
 def _keep_freed_memory() -> None:
     """Tells malloc to keep freed memory, unless the user has configured malloc.
 
-    An update at the paper's sizes allocates and frees 150 MB. Returned to the system
-    and requested again each time, that is 38000 page faults, 5 % of the update's time.
-    Does nothing where the C library is not glibc.
+    An update at the paper's sizes allocates and frees 150 MB. Returning it to the
+    system each time would cost 38000 page faults, 5 % of the update's time. Does
+    nothing if the C library is not glibc.
     """
     if any(name.startswith(_MALLOC_VARIABLES) for name in os.environ):
         return
@@ -121,7 +118,7 @@ def _keep_freed_memory() -> None:
 
 
 def _configure_imported_jax() -> None:
-    """Applies the cache's settings to jax if it was imported before they were made."""
+    """Applies the cache's settings to jax if it has already been imported."""
     jax = sys.modules.get("jax")
     if jax is None:
         return

@@ -1,4 +1,4 @@
-"""Convolution with ReLU; `encoding` has another form of it, for CPUs."""
+"""Convolution with ReLU, computed by XLA. For CPUs see also `native.encoding`."""
 
 import functools
 from typing import Any
@@ -14,14 +14,7 @@ def convolve_relu(images: Array, kernel: Array, bias: Array, stride: int) -> Arr
 
         y[i, j, f] = max(0, b[f] + sum_{u,v,c} x[s i + u, s j + v, c] k[u, v, c, f])
 
-    Args:
-      images: shape [B, H, W, C].
-      kernel: shape [h, w, C, F].
-      bias: shape [F].
-      stride: s, along H and W.
-
-    Returns:
-      Shape [B, (H - h) // s + 1, (W - w) // s + 1, F].
+    Maps [B, H, W, C] to [B, (H - h) // s + 1, (W - w) // s + 1, F].
     """
     chex.assert_rank([images, kernel, bias], [4, 4, 1])
     chex.assert_equal(bias.shape[0], kernel.shape[3])
@@ -49,8 +42,8 @@ def _backward(
     _, to_both = jax.vjp(functools.partial(_plain, stride), images, kernel)
     image_gradient, kernel_gradient = to_both(cotangent)
     if kernel.shape[:2] == (stride, stride):
-        # A penalty on pixels differentiates this once more: XLA's own form of that
-        # takes a fifth of DAC's update on a CPU.
+        # The gradient penalty on pixels differentiates this again. On a CPU XLA's own
+        # version of that takes a fifth of DAC's update.
         image_gradient = tile_gradient(cotangent, kernel, images.shape[1:3])
     return image_gradient, kernel_gradient
 
@@ -60,19 +53,12 @@ _XLA.defvjp(_forward, _backward)
 
 
 def tile_gradient(cotangent: Array, kernel: Array, size: tuple[int, ...]) -> Array:
-    """Returns what a cotangent of a convolution of tiles means for the images.
+    """Returns the image gradient of a convolution whose windows do not overlap.
 
         dx[h i + u, w j + v] = k[u, v] dy[i, j]
 
-    No two windows overlap, so nothing is summed but the features.
-
-    Args:
-      cotangent: shape [B, H // h, W // w, F].
-      kernel: shape [h, w, C, F].
-      size: H and W; what no window reaches gets 0.
-
-    Returns:
-      Shape [B, H, W, C].
+    Maps [B, H // h, W // w, F] to [B, H, W, C] with H, W = `size`; pixels outside all
+    windows get 0.
     """
     chex.assert_rank([cotangent, kernel], 4)
     tiles = jnp.einsum("bijf,uvcf->biujvc", cotangent, kernel)

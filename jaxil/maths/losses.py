@@ -8,22 +8,18 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-_NORM_FLOOR = 1e-12  # under the root: d|g|/dg is undefined at g = 0
+_NORM_FLOOR = 1e-12  # added under the root: d|g|/dg is undefined at g = 0
 
 
 def td_target(reward: Array, discount: Array, next_values: Array) -> Array:
-    """Returns the clipped double-Q target over n steps.
+    """Returns the clipped double-Q target over n steps, without gradient.
 
         y = R_n + gamma^n * min_k Q_k(o', a')
 
     Args:
       reward: R_n, discounted sum of the window's rewards. Shape [B].
-      discount: gamma^n times the environment's discounts; 0 after a true
-        termination, never after a time limit. Shape [B], in [0, 1].
+      discount: gamma^n times the environment's discounts, in [0, 1]. Shape [B].
       next_values: both target critics after the window. Shape [2, B].
-
-    Returns:
-      Targets, without gradient. Shape [B].
 
     Source: Yarats et al. 2021, arXiv:2107.09645, eq. (1).
     """
@@ -34,13 +30,9 @@ def td_target(reward: Array, discount: Array, next_values: Array) -> Array:
 
 
 def critic_loss(values: Array, target: Array) -> Array:
-    """Returns the summed mean squared errors of both critics.
+    """Returns the summed mean squared errors of values [2, B] from targets [B].
 
         L = sum_k mean_b (Q_k - y)^2
-
-    Args:
-      values: shape [2, B].
-      target: shape [B].
 
     Source: Yarats et al. 2021, arXiv:2107.09645, eq. (1); no factor 1/2, as in the
     authors' code.
@@ -51,10 +43,7 @@ def critic_loss(values: Array, target: Array) -> Array:
 
 
 def actor_loss(values: Array) -> Array:
-    """Returns minus the mean of the smaller critic at the actor's own actions.
-
-    Args:
-      values: shape [2, B].
+    """Returns minus the mean of the smaller of both values [2, B].
 
     Source: Yarats et al. 2021, arXiv:2107.09645, eq. (2).
     """
@@ -63,13 +52,10 @@ def actor_loss(values: Array) -> Array:
 
 
 def saturation_penalty(pre_tanh: Array) -> Array:
-    """Returns the mean square of the actor's mean before its tanh.
+    """Returns the mean square of the actor's mean before its tanh, [B, A].
 
-    Where |pre-tanh| is large, the gradient of tanh vanishes and an actor stays at
-    a constant, saturated action for good. Not part of the paper: weight 0 there.
-
-    Args:
-      pre_tanh: shape [B, A].
+    Where |pre-tanh| is large, the gradient of tanh vanishes and the actor is stuck at
+    a saturated action. The paper does not have this penalty: its weight is 0 there.
     """
     chex.assert_rank(pre_tanh, 2)
     return jnp.mean(jnp.square(pre_tanh))
@@ -81,15 +67,10 @@ def discriminator_loss(expert_logits: Array, agent_logits: Array) -> Array:
     With logits l = log D - log(1 - D):  -log D = softplus(-l)  and
     -log(1 - D) = softplus(l), both finite for every l.
 
-    Args:
-      expert_logits: on demonstrations. Shape [B].
-      agent_logits: on replay. Shape [B].
+    Both batches of logits have shape [B]; the loss is the sum of their means.
 
-    Returns:
-      Mean over the expert's plus mean over the agent's. Shape [].
-
-    Source: Cohen et al. 2021, eq. (7), with the labels that eq. (8) needs: read
-    literally, the two would reward looking unlike the expert.
+    Source: Cohen et al. 2021, eq. (7), with the labels that eq. (8) needs: taken
+    literally, the two equations would reward the agent for differing from the expert.
     """
     chex.assert_rank([expert_logits, agent_logits], 1)
     chex.assert_equal_shape([expert_logits, agent_logits])
@@ -101,7 +82,7 @@ def discriminator_loss(expert_logits: Array, agent_logits: Array) -> Array:
 def gradient_penalty(
     logits: Callable[[Any], Array], expert: Any, agent: Any, key: Array
 ) -> Array:
-    """Returns the mean squared distance of the input gradient's norm from one.
+    """Returns the mean squared difference between the input gradient's norm and one.
 
         x_i = u_i e_i + (1 - u_i) a_i,   u_i ~ Uniform(0, 1)
         L   = mean_i (|d l(x_i) / d x_i| - 1)^2
@@ -109,14 +90,11 @@ def gradient_penalty(
     Inputs of several arrays (pixels and an action) count as one long vector.
 
     Args:
-      logits: discriminator of a batch, inputs -> [B], each row by itself.
-      expert: discriminator inputs of demonstrations: a pytree of float arrays, each
+      logits: maps a batch of inputs to [B]; rows are independent.
+      expert: discriminator inputs from demonstrations: a pytree of float arrays, each
         of shape [B, ...].
-      agent: the same of the agent.
+      agent: the agent's, alike.
       key: consumed.
-
-    Returns:
-      The penalty without its weight. Shape [].
 
     Source: Gulrajani et al. 2017, arXiv:1704.00028, eq. (3).
     """
@@ -130,7 +108,7 @@ def gradient_penalty(
         return share * e + (1.0 - share) * a
 
     between = jax.tree.map(blend, expert, agent)
-    # Rows do not see each other, so the gradient of the sum holds every row's own.
+    # Rows are independent, so the gradient of the sum holds the gradient of each.
     gradients = jax.grad(lambda x: jnp.sum(logits(x)))(between)
     squares = [
         jnp.sum(jnp.square(g), axis=tuple(range(1, g.ndim)))
@@ -145,10 +123,7 @@ def cloning_loss(mean: Array, action: Array, *, std: float) -> Array:
 
         L = mean_b sum_a (x - m)^2 / (2 s^2) + log s + log(2 pi) / 2
 
-    Args:
-      mean: m, the policy's means. Shape [B, A], in [-1, 1].
-      action: x, what the expert did. Shape [B, A].
-      std: s, of the policy; fixed.
+    with the policy's mean m and fixed std s, and the expert's action x. Shapes [B, A].
 
     Source: siddhanthaldar/ROT, agent/bc.py; the paper gives neither loss nor s.
     """

@@ -1,9 +1,10 @@
-"""The product of dense layers, with gradients in a form that XLA's CPU does fast.
+"""The matrix product of dense layers, with gradients that are fast on CPUs.
 
-XLA hands matrices to Eigen as they lie. A product that walks through one of them across
-its rows takes twice as long, on one core: 256x1024 with a transposed 1024x1024 5.6 ms,
-not 2.2, and a gradient of 39200x50 10.6, not 5.3. So operands change places here or are
-turned first; barriers keep XLA from undoing it. On other devices it costs small copies.
+XLA passes matrices to Eigen in their memory layout. A product that reads one of them
+across its rows takes twice as long on one core: 256x1024 times a transposed 1024x1024
+takes 5.6 ms instead of 2.2, the gradient of a 39200x50 kernel 10.6 instead of 5.3. So
+operands are swapped or transposed here first, and barriers keep XLA from undoing it.
+On other devices this costs small copies.
 """
 
 from typing import Any
@@ -13,28 +14,21 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-# A kernel so many times longer than wide is walked through the other way.
+# Kernels at least this many times longer than wide are read in the other order.
 _SLENDER = 16
-# Up to so many numbers x is turned for that kernel's gradient: it stays in the caches.
+# For the gradient of those kernels, x is transposed if it has at most this many
+# elements, which fit in the caches.
 _SMALL = 2**20
 
 
 def product(x: Array, kernel: Array) -> Array:
-    """Returns x W. It can be differentiated any number of times.
-
-    Args:
-      x: shape [B, R].
-      kernel: W, shape [R, F].
-
-    Returns:
-      Shape [B, F].
-    """
+    """Returns x W of x [B, R] and W [R, F]; differentiable any number of times."""
     chex.assert_rank([x, kernel], 2)
     return _PRODUCT(x, kernel)
 
 
 def dot_general(x: Array, kernel: Array, *_: Any, **__: Any) -> Array:
-    """Is `product`, as `flax.linen.Dense` calls it."""
+    """Computes `product` with the signature that `flax.linen.Dense` calls."""
     return product(x, kernel)
 
 
@@ -55,7 +49,7 @@ def _transposed_product(y: Array, kernel: Array) -> Array:
 
 
 def _outer_product(x: Array, y: Array) -> Array:
-    """Returns x' y, which is a kernel's gradient."""
+    """Returns x' y, the gradient of a kernel."""
     if x.shape[1] < _SLENDER * y.shape[1]:
         return jnp.matmul(x.T, y)
     if x.size <= _SMALL:

@@ -1,4 +1,4 @@
-"""Entropic optimal transport between two episodes, seen as point clouds."""
+"""Entropic optimal transport between two episodes as sets of features."""
 
 import chex
 import jax
@@ -11,14 +11,7 @@ _NORM_FLOOR = 1e-8  # keeps the cosine finite for an all-zero feature
 def cosine_cost(x: Array, y: Array) -> Array:
     """Returns pairwise cosine distances.
 
-        C_ij = 1 - <x_i, y_j> / (|x_i| |y_j|)
-
-    Args:
-      x: agent features. Shape [T, D].
-      y: expert features. Shape [N, D].
-
-    Returns:
-      Costs in [0, 2]. Shape [T, N].
+        C_ij = 1 - <x_i, y_j> / (|x_i| |y_j|)   of x [T, D] and y [N, D], in [0, 2]
 
     Source: Cohen et al. 2021, eq. (2).
     """
@@ -26,24 +19,16 @@ def cosine_cost(x: Array, y: Array) -> Array:
     chex.assert_equal_shape_suffix([x, y], 1)
     x_unit = x / jnp.maximum(jnp.linalg.norm(x, axis=1, keepdims=True), _NORM_FLOOR)
     y_unit = y / jnp.maximum(jnp.linalg.norm(y, axis=1, keepdims=True), _NORM_FLOOR)
-    # Accelerators round the factors of a product to 11 bits unless told otherwise,
-    # an error that an epsilon of 0.01 would see.
+    # By default accelerators round factors to 11 bits, too coarse for epsilon = 0.01.
     cosine = jnp.matmul(x_unit, y_unit.T, precision=lax.Precision.HIGHEST)
-    # Rounding may leave [-1, 1], and a cost below zero would become a reward above.
+    # Rounding may leave [-1, 1], and a negative cost would be a positive reward.
     return jnp.clip(1.0 - cosine, 0.0, 2.0)
 
 
 def euclidean_cost(x: Array, y: Array) -> Array:
     """Returns pairwise Euclidean distances.
 
-        C_ij = |x_i - y_j|
-
-    Args:
-      x: agent features. Shape [T, D].
-      y: expert features. Shape [N, D].
-
-    Returns:
-      Costs. Shape [T, N].
+        C_ij = |x_i - y_j|   of x [T, D] and y [N, D]
 
     Source: Cohen et al. 2021, fig. 7.
     """
@@ -56,16 +41,11 @@ def euclidean_cost(x: Array, y: Array) -> Array:
 
 
 def simultaneous_plan(cost: Array, expert_mass: Array) -> Array:
-    """Returns the plan that pairs moment t with moment t: no transport at all.
+    """Returns the plan [T, N] that pairs step t with step t, without transport.
 
-        P_tn = 1/T  for  n = min(t, number of the expert's moments - 1),  else 0
+        P_tn = 1/T  for  n = min(t, number of expert steps - 1),  else 0
 
-    Args:
-      cost: read for its shape. Shape [T, N].
-      expert_mass: zero beyond the expert's own moments. Shape [N].
-
-    Returns:
-      Shape [T, N].
+    Only the shape of `cost` is used; `expert_mass` is 0 beyond the expert's own steps.
 
     Source: Cohen et al. 2021, fig. 7.
     """
@@ -80,29 +60,28 @@ def simultaneous_plan(cost: Array, expert_mass: Array) -> Array:
 def sinkhorn_plan(
     cost: Array, expert_mass: Array, *, epsilon: float, num_iterations: int
 ) -> Array:
-    """Returns the entropic transport plan from uniform moments of the agent.
+    """Returns the entropic transport plan; all steps of the agent have equal mass.
 
         P = argmin <P, C> - epsilon * H(P)   with   P 1 = 1/T,  P^T 1 = b
 
-    In the log domain: exp(-C / epsilon) underflows in float32 at the epsilon that
-    imitation needs. The iterations end on the rows, so each moment of the agent
-    carries exactly its share and rewards are not distorted by row mass. A fixed
-    count keeps a vmap over demonstrations parallel.
+    Computed in the log domain, since exp(-C / epsilon) underflows in float32 at the
+    epsilon that imitation needs. The last iteration normalises the rows, so each step
+    of the agent has exactly mass 1/T and rewards are not distorted. A fixed number of
+    iterations keeps a vmap over demonstrations parallel.
 
     Args:
       cost: pairwise costs. Shape [T, N].
-      expert_mass: b, what each moment of the expert carries, see `uniform_mass`; sums
-        to one. Shape [N].
+      expert_mass: b, see `uniform_mass`; sums to one. Shape [N].
       epsilon: weight of the entropy, in units of cost.
       num_iterations: Sinkhorn iterations; static under jit.
 
     Returns:
-      Non-negative plan summing to one. Rows are exact, columns as far as the
-      iterations have converged. Shape [T, N].
+      Non-negative plan that sums to one. Rows are exact, columns are as accurate as
+      the iterations have converged. Shape [T, N].
 
     Source: Peyre and Cuturi 2019, Computational Optimal Transport, sec. 4.4.
     """
-    # Imported here because it takes seconds, which runs without transport save.
+    # Imported here because it takes seconds, and only some methods need it.
     from ott.geometry import geometry
     from ott.problems.linear import linear_problem
     from ott.solvers.linear import sinkhorn
@@ -116,11 +95,11 @@ def sinkhorn_plan(
         lse_mode=True,
         min_iterations=num_iterations,
         max_iterations=num_iterations,
-        # OTT runs whole blocks of this many and drops the remainder, without a word.
+        # OTT runs whole blocks of this many and silently drops the remainder.
         inner_iterations=num_iterations,
         threshold=-1,
     )
-    # Its measure of the marginals' error promotes ranks, which tests forbid.
+    # OTT's error of the marginals promotes ranks, which the tests forbid.
     with jax.numpy_rank_promotion("allow"):
         return solver(problem).matrix
 
@@ -128,22 +107,15 @@ def sinkhorn_plan(
 def sinkhorn_divergence(
     x: Array, y: Array, *, epsilon: float, num_iterations: int
 ) -> Array:
-    """Returns the debiased Sinkhorn divergence of two sets of uniform points.
+    """Returns the debiased Sinkhorn divergence of two sets of points [., D].
 
         S(x, y) = OT(x, y) - (OT(x, x) + OT(y, y)) / 2,   with cosine costs C and
         OT(x, y) = min_P <P, C> + epsilon * KL(P | a b^T),   P 1 = a,  P^T 1 = b
 
-    OT alone is not zero between a set and itself: entropy blurs its plan. S is, is
-    symmetric and, for these costs, nowhere below zero.
+    Entropy blurs the plan, so OT(x, x) > 0. S is symmetric, zero between a set and
+    itself and, for these costs, never negative.
 
-    Args:
-      x: shape [T, D].
-      y: shape [N, D].
-      epsilon: weight of the entropy, in units of cost.
-      num_iterations: Sinkhorn iterations; static under jit.
-
-    Returns:
-      Shape [].
+    See `sinkhorn_plan` for the arguments.
 
     Source: Feydy et al. 2019, Interpolating between Optimal Transport and MMD using
     Sinkhorn Divergences, eq. (1), (3) and theorem 1.
@@ -162,16 +134,9 @@ def sinkhorn_divergence(
 
 
 def uniform_mass(num_moments: Array, length: int) -> Array:
-    """Shares a mass of one out over an episode's own moments.
+    """Returns masses [length], equal for an episode's own steps and 0 for padding.
 
-        b_n = 1 / num_moments for n < num_moments, else 0
-
-    Args:
-      num_moments: shape [].
-      length: N, with what fills an episode up to the length of others.
-
-    Returns:
-      Masses. Shape [N].
+    b_n = 1 / num_moments for n < num_moments, else 0
     """
     chex.assert_rank(num_moments, 0)
     own = jnp.arange(length) < num_moments
@@ -179,16 +144,11 @@ def uniform_mass(num_moments: Array, length: int) -> Array:
 
 
 def transport_rewards(cost: Array, plan: Array) -> Array:
-    """Shares a transport cost out over the agent's moments.
+    """Returns what each step of the agent contributes to the transport cost.
 
         r_t = - sum_n C_tn P_tn,   so that   sum_t r_t = - <C, P>
 
-    Args:
-      cost: shape [T, N].
-      plan: shape [T, N].
-
-    Returns:
-      Rewards, never positive. Shape [T].
+    Cost and plan have shape [T, N]; rewards have shape [T] and are never positive.
 
     Source: Cohen et al. 2021, eq. (4).
     """

@@ -1,21 +1,22 @@
-"""Names for the values that travel between the rooms; NumPy's and jax's alike.
+"""Types that several packages share; their arrays are NumPy's or jax's.
 
 Axes, everywhere in this project: B batch, T agent time, N expert time,
 K demonstrations, H W C pixels (channels last, the stack folded into C),
 S state vector, R representation, D feature, A action, n steps of a window.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
-Params = Any  # a pytree of arrays, as flax makes it
+Params = Any  # a pytree of arrays, from flax
 Data = Any  # an array: NumPy's on the host, jax's inside jitted functions
-Metrics = dict[str, Any]  # scalars, left on the device until they are logged
+Metrics = dict[str, Any]  # scalars, kept on the device until they are logged
 
 
 class Window(NamedTuple):
     """All transitions of n-step windows, for methods that relabel samples.
 
-    The observation after the last one is the batch's `next_observation`.
+    The observation after the window is the batch's `next_observation`.
 
     Attributes:
       observation: uint8 [B, n, H, W, C], or float32 [B, n, S].
@@ -53,14 +54,26 @@ class Batch(NamedTuple):
     successor: Data | None = None
     window: Window | None = None
 
+    def map_observations(self, function: Callable[[Data], Data]) -> "Batch":
+        """Returns a batch with the function's results instead of all observations."""
+        successor, window = self.successor, self.window
+        if window is not None:
+            window = window._replace(observation=function(window.observation))
+        return self._replace(
+            observation=function(self.observation),
+            next_observation=function(self.next_observation),
+            successor=None if successor is None else function(successor),
+            window=window,
+        )
+
 
 class ExpertBatch(NamedTuple):
     """Observations sampled from the demonstrations.
 
     Attributes:
       observation: uint8 [B, H, W, C], or float32 [B, S].
-      action: what the expert did there. Shape [B, A]; zeros where unknown. Read only
-        by methods that declare that they see actions.
+      action: the expert's. Shape [B, A]; zeros where unknown. Read only by methods
+        that declare that they see actions.
       successor: the next observation; None unless the method asks for it.
     """
 
@@ -76,9 +89,9 @@ class Episode(NamedTuple):
       frames: uint8 [T + 1, H, W, 3], or float32 [T + 1, S]; the first one is the
         observation at reset.
       actions: shape [T, A].
-      rewards: rewards[t] belongs to the transition from o_t to o_{t+1}: the task's
-        where the environment ends, the method's in the replay. Shape [T].
-      discounts: the environment's: 0 after a true end, 1 at a time limit. Shape [T].
+      rewards: rewards[t] belongs to (o_t, a_t, o_{t+1}). The environment's, or in the
+        replay the method's. Shape [T].
+      discounts: the environment's: 0 at a true end, 1 at a time limit. Shape [T].
     """
 
     frames: Data
@@ -93,8 +106,8 @@ class ExpertEpisodes(NamedTuple):
     Attributes:
       frames: uint8 [K, N + 1, H, W, 3], or float32 [K, N + 1, S]. A shorter episode
         repeats its last frame.
-      num_frames: how many of them are the episode's own. Shape [K].
-      actions: shape [K, N, A]; [K, 0, 0] where they are not known.
+      num_frames: number of frames without the padding. Shape [K].
+      actions: shape [K, N, A]; [K, 0, 0] if unknown.
     """
 
     frames: Data

@@ -1,1 +1,1 @@
-"""The encoder in C: sources, build, and its jax function."""
+"""The encoder in C: sources, compilation and jax function."""

@@ -1,10 +1,10 @@
-/* Convolutions and their gradients as blocks of sums in registers.
+/* Convolutions and their gradients, accumulated in blocks of registers.
 
-   A convolution is a sum of products of one number with a vector of features. A block
-   of BLOCK points times two vectors is summed up in registers: that many independent
-   sums hide the latency of a multiply-add, and each vector that is loaded is used BLOCK
-   times. Both lengths are known to the compiler, which unrolls what loops over them.
-   Features have to come in multiples of two vectors. */
+   A convolution sums products of a number with a vector of features. BLOCK points times
+   two vectors accumulate in registers: enough independent sums to hide the latency of a
+   multiply-add, with BLOCK uses of each vector that is loaded. Both lengths are known
+   at compile time, so loops over them are unrolled. The number of features must be a
+   multiple of two vectors. */
 
 #ifndef JAXIL_BLOCKS_H
 #define JAXIL_BLOCKS_H
@@ -16,7 +16,7 @@
 #error "it is for GCC: what clang makes of it is half as fast as XLA's"
 #endif
 
-/* Of 32 registers 28 are sums, of 16 registers 12. */
+/* 28 of 32 registers, or 12 of 16, hold sums. */
 #if defined(__AVX512F__)
 #define LANES 16
 #define BLOCK 14
@@ -34,7 +34,7 @@ typedef int32_t Mask __attribute__((vector_size(4 * LANES), aligned(4), may_alia
 #define INLINE static inline __attribute__((always_inline))
 #define UNROLL _Pragma("GCC unroll 16")
 
-/* Calls FUNCTION(n, ...) with an n that the compiler knows, of 1 to BLOCK. */
+/* Calls FUNCTION(n, ...) with n in 1 ... BLOCK as a compile-time constant. */
 #define CASE(n, FUNCTION, ...)                    \
   case n:                                         \
     FUNCTION(n < BLOCK ? n : BLOCK, __VA_ARGS__); \
@@ -64,30 +64,30 @@ typedef struct {
   size_t stride, out_height, out_width;         /* of the output */
 } Shape;
 
-/* Where the points of an output lie: their numbers may stand in a larger array. */
+/* The points of an output, which may be part of a larger array. */
 typedef struct {
   float *at;
-  size_t row, step; /* from a point to the one below it, and to the one beside it */
+  size_t row, step; /* offsets to the next point below and to the right */
 } Points;
 
 INLINE Points one_after_the_other(const Shape *s, float *at) {
   return (Points){at, s->out_width * s->features, s->features};
 }
 
-/* What is done with a sum: relu(sum + bias), with one bias for each feature; or the
-   sum where a gate, with a number for each sum, is above zero, and 0 elsewhere. */
+/* What follows a sum: relu(sum + bias), with one bias per feature; or, with one gate
+   per sum, the sum where the gate is positive and 0 elsewhere. */
 typedef struct {
   const float *bias, *gate;
 } Finish;
 
-/* What is no number stays so, as in jax: a run that diverges has to be seen. */
+/* NaN stays NaN, as in jax, so that divergence is noticed. */
 INLINE Vector relu(Vector x) { return (Vector)((Mask)x & ~(x <= (Vector){0})); }
 
 INLINE Vector gated(Vector x, Vector gate) {
   return (Vector)((Mask)x & (gate > (Vector){0}));
 }
 
-/* Of the sum of a point and a feature; gates are numbered by point. */
+/* The gate is indexed by point and feature. */
 INLINE Vector finished(Vector sum, const Finish *finish, size_t point, size_t feature,
                        size_t features) {
   if (finish->bias) return relu(sum + *(const Vector *)(finish->bias + feature));
@@ -113,7 +113,7 @@ INLINE void sum_points(size_t n, const float *x, size_t step, size_t row, size_t
   }
 }
 
-/* y[p] = sums[p], finished; point is the number of the first. */
+/* y[p] = finished(sums[p]); `point` is the index of the first. */
 INLINE void convolve_points(size_t n, const Shape *s, const float *x, const float *w,
                             const Finish *finish, size_t point, size_t feature,
                             float *y, size_t y_step) {
@@ -159,7 +159,7 @@ INLINE void correlate_points(size_t n, const float *x, size_t step, size_t row,
   }
 }
 
-/* y = x * w of one image, finished. */
+/* y = finished(x * w) of one image. */
 static void convolve(const Shape *s, const float *x, const float *w,
                      const Finish *finish, Points y) {
   const size_t blocks = (s->out_width + BLOCK - 1) / BLOCK;
@@ -174,7 +174,7 @@ static void convolve(const Shape *s, const float *x, const float *w,
       }
 }
 
-/* w += what one image and the cotangent g of its output mean for the kernel. */
+/* Adds the kernel gradient of one image x, with the output's cotangent g, to w. */
 static void correlate(const Shape *s, const float *x, Points g, float *w) {
   const size_t row = s->width * s->channels, step = s->stride * s->channels;
   const size_t length = s->kernel_width * s->channels;

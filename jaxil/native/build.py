@@ -1,8 +1,8 @@
 """The encoder in C: compiled for this machine's processor, registered with XLA.
 
-XLA's convolutions reach two thirds of what a CPU core can do, and make twice as many
-products as 3x3 kernels need: `launch/results/README.md`, changes 10 and 12. The C
-compiler is the machine's; without one, and on other devices, XLA's own are used.
+XLA's convolutions reach two thirds of a CPU core's peak and compute twice as many
+products as 3x3 kernels need: `launch/results/README.md`, changes 10 and 12. Without a C
+compiler, and on other devices, XLA's convolutions are used.
 """
 
 import ctypes
@@ -28,16 +28,12 @@ _DIGEST_BYTES = 32  # SHA-256, appended to the library; the loader ignores it
 
 
 class BuildError(Exception):
-    """The library cannot be compiled; the message says why and what helps."""
+    """The library cannot be compiled; the message says why and what to do."""
 
 
 @functools.cache
 def problem() -> str | None:
-    """Loads the library, compiled if need be, and registers its functions with XLA.
-
-    Returns:
-      None if it can be used, else why not.
-    """
+    """Loads the library and registers its functions; returns why it failed, or None."""
     if jax.default_backend() != "cpu":
         return f"it is for CPUs, and jax computes on {jax.default_backend()}"
     try:
@@ -47,29 +43,27 @@ def problem() -> str | None:
     try:
         register(ctypes.CDLL(str(path)))
     except (AttributeError, OSError) as error:
-        path.unlink(missing_ok=True)  # what the compiler made is no library
+        path.unlink(missing_ok=True)  # the compiler wrote something else
         return str(error)
     return None
 
 
 def register(library: ctypes.CDLL) -> None:
-    """Tells XLA where the functions are that `native.encoding` calls."""
+    """Registers the functions that `native.encoding` calls with XLA."""
     for name in _FUNCTIONS:
         target = jax.ffi.pycapsule(getattr(library, name))
         jax.ffi.register_ffi_target(name, target, platform="cpu")
 
 
 def build(folder: pathlib.Path, flags: tuple[str, ...] = FLAGS) -> pathlib.Path:
-    """Returns the library's file in a folder; compiles it if it is missing or damaged.
+    """Returns the path of the library, compiled if it is missing or damaged.
 
-    Args:
-      folder: made if missing; processes and machines may share it.
-      flags: for the compiler.
+    The folder is created if missing; processes and machines may share it.
 
     Raises:
       BuildError: there is no compiler, or it failed.
     """
-    # The last item is what -march=native depends on.
+    # -march=native depends on the instruction set.
     key = hashlib.sha256(repr((flags, devices.instruction_set())).encode())
     for source in (_SOURCE, *sorted(_SOURCES.glob("*.h"))):
         key.update(source.read_bytes())
@@ -96,9 +90,9 @@ def build(folder: pathlib.Path, flags: tuple[str, ...] = FLAGS) -> pathlib.Path:
 
 
 def _is_whole(path: pathlib.Path) -> bool:
-    """Returns whether a library ends in the digest of all before it.
+    """Returns whether a library ends in the digest of what comes before.
 
-    A process that loads a truncated library dies of SIGBUS, so this is checked first.
+    Checked first, because loading a truncated library kills the process with SIGBUS.
     """
     try:
         content = path.read_bytes()

@@ -1,11 +1,11 @@
 /* An encoder's convolutions with ReLU, and their gradients, for XLA on a CPU.
 
-   `encoding.py` says what each function computes; shapes and names are its own. Arrays
-   are channels last, and VALID: every window lies in its image. A thread takes an image
-   through all layers, so that what lies between them stays in its cache.
+   `encoding.py` defines what each function computes, with the same names and shapes.
+   Arrays are channels last. Each thread passes an image through all layers, so that
+   intermediate outputs stay in its cache.
 
-   This file is XLA's side: buffers in, buffers out, a batch shared out to threads. What
-   is done with an image is in the headers. */
+   This file is the interface to XLA and distributes a batch among threads; the headers
+   process one image. */
 
 #include <stdint.h>
 #include <stdlib.h>
@@ -22,14 +22,14 @@ typedef struct {
   Layer layers[MOST_LAYERS];
   const uint8_t *pixels;
   const float *mean;
-  size_t mean_size; /* 1, or that of an image */
+  size_t mean_size; /* 1, or the size of an image */
   float contrast;
-  float *y[MOST_LAYERS];         /* outputs of the layers; NULL: not wanted */
+  float *y[MOST_LAYERS];         /* outputs of the layers; NULL: not needed */
   const float *cotangent;        /* of the last one */
-  float *sums;                   /* of gradients, one after the other */
-  size_t num_sums, sum_size;     /* how many, and numbers in one */
-  size_t gradients[MOST_LAYERS]; /* where the gradients of a layer begin in it */
-  float *kernels;                /* what `prepare` has allocated */
+  float *sums;                   /* partial sums of the gradients */
+  size_t num_sums, sum_size;     /* their number, and the size of one */
+  size_t gradients[MOST_LAYERS]; /* offset of each layer's gradients in a sum */
+  float *kernels;                /* allocated by `prepare` */
 } Call;
 
 static XLA_FFI_Error *no_memory(XLA_FFI_CallFrame *frame) {
@@ -41,9 +41,9 @@ static XLA_FFI_Error *no_memory(XLA_FFI_CallFrame *frame) {
   return frame->api->XLA_FFI_Error_Create(&error);
 }
 
-/* Says which interface this was compiled for, where XLA asks for no more than that. */
+/* Returns whether XLA only asks for the interface version, after answering it. */
 static int answers_metadata(XLA_FFI_CallFrame *frame) {
-  /* Its type has another name in jaxlib 0.10 than in 0.12. */
+  /* The type's name differs between jaxlib 0.10 and 0.12. */
   const void *extension = frame->extension_start;
   if (extension == NULL || frame->extension_start->type != XLA_FFI_Extension_Metadata)
     return 0;
@@ -62,11 +62,10 @@ static const XLA_FFI_Buffer *result(XLA_FFI_CallFrame *frame, int k) {
   return frame->rets.rets[k];
 }
 
-/* Reads the call: pixels, mean, then kernel and bias of each layer; the contrast and
-   the strides. */
+/* Reads pixels, mean, kernel and bias of each layer, contrast and strides. */
 static Call read_call(XLA_FFI_CallFrame *frame, size_t layers) {
   const XLA_FFI_Buffer *pixels = argument(frame, 0), *mean = argument(frame, 1);
-  const XLA_FFI_Scalar *contrast = frame->attrs.attrs[0]; /* in the names' order */
+  const XLA_FFI_Scalar *contrast = frame->attrs.attrs[0]; /* sorted by name */
   const XLA_FFI_Array *strides = frame->attrs.attrs[1];
   Call call = {
       .batch = pixels->dims[0],
@@ -102,8 +101,8 @@ static Call read_call(XLA_FFI_CallFrame *frame, size_t layers) {
   return call;
 }
 
-/* Allocates and fills the kernels that are not used as they are. For the way back all
-   layers but the first have one that is turned around. */
+/* Allocates and fills transformed kernels. The backward pass flips those of all layers
+   but the first. */
 static int prepare(Call *call, int backward) {
   size_t size = 0;
   for (size_t l = 0; l < call->count; l++) {
@@ -140,7 +139,7 @@ static void centre(const Call *call, size_t image, float *x) {
   const size_t size = image_size(&call->layers[0].shape);
   const uint8_t *pixels = call->pixels + image * size;
   const float *mean = call->mean, contrast = call->contrast;
-  const float share = 1.0f / 255.0f; /* a division would take as long as a layer */
+  const float share = 1.0f / 255.0f; /* dividing would take as long as a layer */
   if (call->mean_size == 1) {
     for (size_t k = 0; k < size; k++) x[k] = contrast * (pixels[k] * share - *mean);
   } else {
@@ -148,7 +147,7 @@ static void centre(const Call *call, size_t image, float *x) {
   }
 }
 
-/* Numbers in the largest output of a layer. */
+/* Size of the largest output of a layer. */
 static size_t largest_output(const Call *call) {
   size_t most = 0;
   for (size_t l = 0; l < call->count; l++)
@@ -178,7 +177,7 @@ static void encode_image(void *data, size_t image, float *x) {
   }
 }
 
-/* pixels, mean, (kernel, bias) of each layer -> y of each layer, or of the last one */
+/* pixels, mean, (kernel, bias) of each layer -> y of the last layers */
 XLA_FFI_Error *jaxil_encode(XLA_FFI_CallFrame *frame) {
   if (answers_metadata(frame)) return NULL;
   Call call = read_call(frame, (frame->args.size - 2) / 2);
@@ -192,12 +191,12 @@ XLA_FFI_Error *jaxil_encode(XLA_FFI_CallFrame *frame) {
   return done ? NULL : no_memory(frame);
 }
 
-/* So many images have one sum of their gradients. It is a constant, and the sums are
-   added up in order: the result doesn't depend on the number of threads. */
+/* Images per partial sum of gradients. The number is constant and partial sums are
+   added in order, so the result does not depend on the number of threads. */
 #define IMAGES_OF_A_SUM 4
 
-/* Numbers in the array for the cotangent of layer l. The first has no frame: nobody
-   asks for the gradient of pixels. */
+/* Size of the array for the cotangent of layer l. The first layer needs no frame, since
+   pixels have no gradient. */
 static size_t cotangent_size(const Layer *layer, size_t l) {
   return l ? image_size(&layer->back) : output_size(&layer->shape);
 }
@@ -222,7 +221,7 @@ static size_t gradient_scratch(const Call *call) {
   return image_size(&call->layers[0].shape) + 2 * largest_cotangent(call) + scratch;
 }
 
-/* Goes back through the layers of an image, from the last one's cotangent. */
+/* Backpropagates the last layer's cotangent through all layers of an image. */
 static void differentiate_image(const Call *call, size_t image, float *sums, float *x) {
   const Layer *layers = call->layers;
   const size_t last = call->count - 1, size = output_size(&layers[last].shape);

@@ -1,4 +1,4 @@
-"""An encoder's convolutions in C: all layers of an image at once, for CPUs."""
+"""The encoder's convolutions in C, for CPUs: all layers, image by image."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -9,13 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-# By two vectors of a processor it takes features; no CPU's vectors are longer.
-FEATURES = 32
+FEATURES = 32  # two of the longest vectors that CPUs have
 MOST_LAYERS = 8
 
 
 class Weights(NamedTuple):
-    """Of one layer.
+    """The parameters of one layer.
 
     Attributes:
       kernel: float32 [h, w, C, F], F a multiple of FEATURES.
@@ -40,16 +39,16 @@ def encode(
         x_l[i, j, f] = max(0, z[i, j, f])
         z[i, j, f] = b[f] + sum_{u,v,c} x_{l-1}[s i + u, s j + v, c] k[u, v, c, f]
 
-    `native.build` must have loaded the library. It can be differentiated once, for the
-    weights; pixels and mean have no gradient. Kernels of 3x3 without stride use
-    `winograd.h`, which rounds differently and spreads non-finite values by a pixel.
+    `native.build` must have loaded the library. Only first derivatives with respect to
+    the weights are defined. Kernels of 3x3 with stride 1 use `winograd.h`, which rounds
+    differently and spreads non-finite values by a pixel.
 
     Args:
       pixels: uint8 [B, H, W, C].
-      mean: float32 [H, W, C], or of one number, any rank.
-      weights: of each layer, at most MOST_LAYERS.
+      mean: float32 [H, W, C], or one number of any rank.
+      weights: at most MOST_LAYERS.
       contrast: factor on the centred pixels.
-      strides: s of each layer, along both sides.
+      strides: s of each layer.
 
     Returns:
       The last layer's output, float32 [B, H', W', F].
@@ -74,15 +73,6 @@ class _Settings(NamedTuple):
     strides: tuple[int, ...]
 
 
-class _Saved(NamedTuple):
-    """What the gradients need; an output tells where ReLU let pass."""
-
-    pixels: Array
-    mean: Array
-    weights: tuple[Weights, ...]
-    outputs: Sequence[Array]
-
-
 def _encode(
     settings: _Settings, pixels: Array, mean: Array, weights: tuple[Weights, ...]
 ) -> Array:
@@ -92,15 +82,17 @@ def _encode(
 
 def _forward(
     settings: _Settings, pixels: Array, mean: Array, weights: tuple[Weights, ...]
-) -> tuple[Array, _Saved]:
+) -> tuple[Array, tuple]:
     outputs = _outputs(settings, pixels, mean, weights, wanted=len(weights))
-    return outputs[-1], _Saved(pixels, mean, weights, outputs)
+    # Outputs are positive where ReLU was active.
+    return outputs[-1], (pixels, mean, weights, outputs)
 
 
 def _backward(
-    settings: _Settings, saved: _Saved, cotangent: Array
+    settings: _Settings, saved: tuple, cotangent: Array
 ) -> tuple[None, None, tuple[Weights, ...]]:
-    shapes = [_array(*leaf.shape) for leaf in jax.tree.leaves(saved.weights)]
+    _, _, weights, _ = saved
+    shapes = [_array(*leaf.shape) for leaf in jax.tree.leaves(weights)]
     gradients = _call("jaxil_encode_gradient", shapes, settings, saved, cotangent)
     of_layers = zip(gradients[::2], gradients[1::2], strict=True)
     return None, None, tuple(Weights(*layer) for layer in of_layers)
@@ -118,7 +110,7 @@ def _outputs(
     *,
     wanted: int,
 ) -> Sequence[Array]:
-    """Returns the outputs of the last layers, as many as are wanted."""
+    """Returns the outputs of the last `wanted` layers."""
     size, shapes = pixels.shape[1:3], []
     for (kernel, _), stride in zip(weights, settings.strides, strict=True):
         assert all(n >= k for n, k in zip(size, kernel.shape)), (size, kernel.shape)
@@ -137,7 +129,7 @@ def _call(
     settings: _Settings,
     *arguments: Any,
 ) -> Sequence[Array]:
-    """Calls a function of encoder.c with the leaves of the arguments in their order."""
+    """Calls a function of encoder.c with the leaves of the arguments."""
     call = jax.ffi.ffi_call(name, results, vmap_method="sequential")
     return call(
         *jax.tree.leaves(arguments),

@@ -1,4 +1,4 @@
-/* An encoder of one image: its layers forward, and their gradients backward. */
+/* The forward and backward pass of each layer, for one image. */
 
 #ifndef JAXIL_LAYERS_H
 #define JAXIL_LAYERS_H
@@ -8,12 +8,12 @@
 #include "blocks.h"
 #include "winograd.h"
 
-/* A convolution, and the one that takes a cotangent back to its image: of the cotangent
-   in a frame of zeros with the kernel turned around. */
+/* A convolution, and `back`, which computes its image gradient: the convolution of the
+   cotangent, in a frame of zeros, with the flipped kernel. */
 typedef struct {
   Shape shape, back;
-  int winograd, back_winograd;  /* whether it is computed in Winograd's form */
-  const float *kernel, *turned; /* transformed then */
+  int winograd, back_winograd;  /* whether Winograd's form is used */
+  const float *kernel, *turned; /* transformed if so */
   const float *bias;
 } Layer;
 
@@ -50,8 +50,8 @@ static Layer make_layer(Shape s) {
   };
 }
 
-/* Where a layer's cotangent lies in its frame: its points as far apart as the windows,
-   and zeros around as far as the kernel reaches. */
+/* The points of a layer's cotangent in its frame: spaced by the stride, with a border
+   of zeros as wide as the kernel reaches. */
 static Points in_frame(const Layer *layer, float *frame) {
   const Shape *s = &layer->shape, *back = &layer->back;
   const size_t row = back->width * back->channels;
@@ -72,7 +72,7 @@ static void turn_kernel(const Shape *s, const float *from, float *to) {
         *to++ = from[((window - 1 - v) * s->channels + c) * s->features + f];
 }
 
-/* How much scratch a layer wants, in numbers. */
+/* Scratch that a layer needs, in floats. */
 static size_t forward_scratch(const Layer *layer) {
   return layer->winograd ? winograd_convolve_scratch(&layer->shape) : 0;
 }
@@ -95,8 +95,8 @@ static void go_forward(const Layer *layer, const float *x, float *y, float *scra
     convolve(s, x, layer->kernel, &finish, points);
 }
 
-/* Adds to the kernel's and the bias's gradient what x and the cotangent g of x * kernel
-   + bias mean for them. */
+/* Adds the gradients of kernel and bias, where g is the cotangent of x * kernel + bias.
+ */
 static void add_gradients(const Layer *layer, const float *x, Points g, float *kernel,
                           float *bias, float *scratch) {
   const Shape *s = &layer->shape;
@@ -111,7 +111,7 @@ static void add_gradients(const Layer *layer, const float *x, Points g, float *k
     correlate(s, x, g, kernel);
 }
 
-/* The cotangent of the layer before: of its sums, whose relu is x. */
+/* Computes the previous layer's cotangent before its ReLU, whose output is x. */
 static void go_backward(const Layer *layer, const float *frame, const float *x,
                         Points g, float *scratch) {
   const Finish finish = {.gate = x};
@@ -121,7 +121,7 @@ static void go_backward(const Layer *layer, const float *frame, const float *x,
     convolve(&layer->back, frame, layer->turned, &finish, g);
 }
 
-/* g = what a cotangent of y = relu(z) means for z. */
+/* g = the cotangent of z, given that of y = relu(z). */
 static void pass_relu(const Shape *s, const float *y, const float *cotangent,
                       Points g) {
   for (size_t i = 0; i < s->out_height; i++)

@@ -1,4 +1,4 @@
-/* Work that is shared out to the threads that XLA has. */
+/* Parallel work on XLA's thread pool. */
 
 #ifndef JAXIL_THREADS_H
 #define JAXIL_THREADS_H
@@ -10,11 +10,11 @@
 
 #include "xla/ffi/api/c_api.h"
 
-/* What is done with a part of a call; the scratch is the thread's, and stays in its
+/* Processes one part of a call. Each thread has its own scratch, which stays in its
    cache from one part to the next. */
 typedef void Work(void *call, size_t part, float *scratch);
 
-/* Parts of a batch that are handed out one by one. The last of its users frees it. */
+/* Hands out the parts of a batch one by one. The last user frees it. */
 typedef struct {
   Work *work;
   void *call;
@@ -27,7 +27,7 @@ static void leave(Team *team) {
   if (atomic_fetch_sub(&team->users, 1) == 1) free(team);
 }
 
-/* Works on parts as long as there are any. */
+/* Processes parts until none are left. */
 static void work_on(Team *team) {
   float *scratch = NULL;
   size_t part;
@@ -57,7 +57,7 @@ static int succeeded(XLA_FFI_CallFrame *frame, XLA_FFI_Error *error) {
   return 0;
 }
 
-/* Returns how many threads XLA has; 1 where it doesn't tell. */
+/* Returns the number of XLA's threads; 1 if unknown. */
 static size_t number_of_threads(XLA_FFI_CallFrame *frame) {
   int64_t threads = 1;
   XLA_FFI_ThreadPool_NumThreads_Args args = {
@@ -69,9 +69,9 @@ static size_t number_of_threads(XLA_FFI_CallFrame *frame) {
   return known && threads > 1 ? (size_t)threads : 1;
 }
 
-/* Works on all parts, with the threads of XLA that are free. A thread that comes too
-   late finds none left; so only parts in work are waited for, and that always ends.
-   Returns 0 if there was no memory for scratches of so many numbers. */
+/* Processes all parts on XLA's free threads and this one. A thread that starts late
+   finds nothing left, so this only waits for parts in progress and cannot deadlock.
+   Returns 0 if a scratch of `scratch_size` floats could not be allocated. */
 static int for_each(size_t count, XLA_FFI_CallFrame *frame, Work *work, void *call,
                     size_t scratch_size) {
   Team *team = malloc(sizeof(Team));

@@ -1,27 +1,27 @@
-/* Winograd's convolution of 3x3 kernels: 4 products in place of 9 for each output.
+/* Winograd's convolution with 3x3 kernels: 4 products instead of 9 per output.
 
-   A tile of 4x4 points of an image makes 2x2 points of the output:
+   A tile of 4x4 points of the image gives 2x2 points of the output:
 
        Y = A' [(G k G') * (B' X B)] A,   * elementwise, summed over channels
 
-   (Lavin and Gray, 2016, arXiv 1509.09308, F(2x2, 3x3)). Each of the 16 elements is a
-   product of a matrix tiles x channels with one channels x features. The kernel's
-   gradient is the transpose of it:
+   (Lavin and Gray, 2016, arXiv 1509.09308, F(2x2, 3x3)). Each of the 16 elements is the
+   product of a tiles x channels with a channels x features matrix. The gradient of the
+   kernel is the transpose:
 
        dk = G' [sum over tiles of (B' X B) * (A dY A')] G
 
-   The factors are 1 and 1/2, and a sum has 32 terms where it had 288: rounding errors
-   are no larger than those of the plain sum. */
+   All factors are 1 or 1/2, and sums have 32 terms instead of 288, so rounding errors
+   are no larger than those of the direct sum. */
 
 #ifndef JAXIL_WINOGRAD_H
 #define JAXIL_WINOGRAD_H
 
 #include "blocks.h"
 
-#define SIDE 4 /* of a tile of the image; of the output it is 2 */
+#define SIDE 4 /* of a tile of the image; 2 for the output */
 #define ELEMENTS (SIDE * SIDE)
 
-/* y = B' x, of vectors that lie `step` apart. */
+/* y = B' x, for vectors `step` apart. */
 INLINE void image_transform(const Vector *x, Vector *y, size_t step) {
   y[0] = x[0] - x[2 * step];
   y[step] = x[step] + x[2 * step];
@@ -60,8 +60,8 @@ INLINE void gradient_transform(const Vector *x, Vector *y, size_t step) {
   y[2 * step] = even + x[3 * step];
 }
 
-/* y[i][j] = T x T' of n x n vectors, where T makes m vectors of n: columns, then rows.
-   Both arrays have rows of SIDE vectors. */
+/* y = T x T', where T maps n vectors to m: columns first, then rows. Both arrays have
+   rows of SIDE vectors. */
 #define TRANSFORM(T, n, m, x, y)                                          \
   do {                                                                    \
     Vector half[SIDE][SIDE];                                              \
@@ -71,9 +71,8 @@ INLINE void gradient_transform(const Vector *x, Vector *y, size_t step) {
     for (size_t i_ = 0; i_ < (m); i_++) T(half[i_], y[i_], 1);            \
   } while (0)
 
-/* Which tile of an image: its first point of the output. In an odd row or column the
-   last tile begins one point early, and has `again` rows or columns that another tile
-   has had. */
+/* A tile, by its first output point. If the output's height or width is odd, the last
+   tile starts one point early and repeats `again` rows or columns of another. */
 typedef struct {
   size_t i, j, i_again, j_again;
 } Tile;
@@ -91,7 +90,7 @@ static size_t count_tiles(const Shape *s) {
   return halves(s->out_height) * halves(s->out_width);
 }
 
-/* Whether a convolution, or its gradient for the kernel, can be computed so. */
+/* Whether a convolution and its kernel gradient can be computed in this form. */
 static int suits_winograd(const Shape *s) {
   return s->kernel_height == 3 && s->kernel_width == 3 && s->stride == 1 &&
          s->channels % PAIR == 0 && s->out_height >= 2 && s->out_width >= 2;
@@ -127,7 +126,7 @@ static void transform_gradient(const Shape *s, const float *u, float *gradient) 
   }
 }
 
-/* points[element, c] = (B' X B)[element] of one tile; elements lie `step` apart. */
+/* points[element, c] = (B' X B)[element] of one tile; elements are `step` apart. */
 INLINE void transform_tile(const Shape *s, const float *x, Tile tile, float *points,
                            size_t step) {
   const float *from = x + (tile.i * s->width + tile.j) * s->channels;
@@ -144,7 +143,7 @@ INLINE void transform_tile(const Shape *s, const float *x, Tile tile, float *poi
   }
 }
 
-/* y[i, j, f] = (A' sums A)[i, j] of one tile, finished. */
+/* y[i, j, f] = finished((A' sums A)[i, j]) of one tile. */
 INLINE void finish_tile(const Shape *s, const float *sums, size_t step, Tile tile,
                         const Finish *finish, Points y) {
   for (size_t f = 0; f < s->features; f += LANES) {
@@ -181,16 +180,15 @@ INLINE void transform_cotangent(const Shape *s, Points g, Tile tile, float *poin
   }
 }
 
-/* Asks for part k of n of an array. Tiles are read and written in bursts between the
-   products: without this a core would wait for the memory in each of them, and idle
-   the memory in between. */
+/* Prefetches part k of n of an array. Tiles are read and written in bursts between the
+   products; without this the core would wait for memory in each burst. */
 INLINE void prefetch(const float *array, size_t size, size_t k, size_t n) {
   const size_t line = 64 / sizeof(float);
   for (size_t p = size * k / n; p < size * (k + 1) / n; p += line)
     __builtin_prefetch(array + p, 0, 2);
 }
 
-/* How many numbers `winograd_convolve` wants as its scratch: a block of tiles. */
+/* Scratch that `winograd_convolve` needs, in floats: a block of tiles. */
 static size_t winograd_convolve_scratch(const Shape *s) {
   return ELEMENTS * BLOCK * (s->channels + s->features);
 }
@@ -207,14 +205,14 @@ INLINE void multiply_points(size_t n, const Shape *s, const float *points,
   }
 }
 
-/* y = x * k of one image, finished; u is the transformed kernel. */
+/* y = finished(x * k) of one image; u is the transformed kernel. */
 static void winograd_convolve(const Shape *s, const float *x, const float *u,
                               const Finish *finish, Points y, float *scratch) {
   const size_t tiles = count_tiles(s), blocks = (tiles + BLOCK - 1) / BLOCK;
   const size_t step = BLOCK * s->channels, sums_step = BLOCK * s->features;
   const size_t row = s->width * s->channels, pairs = s->channels * s->features;
-  /* One pair of features has been read when its sums are written: then in the same
-     place, which halves what the cache has to hold. */
+  /* With one pair of channels, the inputs have been read when the sums are written.
+     Overwriting them halves the use of the cache. */
   const int in_place = s->features == PAIR && s->channels == PAIR;
   float *sums = in_place ? scratch : scratch + ELEMENTS * step;
   for (size_t q = 0; q < blocks; q++) {
@@ -234,16 +232,16 @@ static void winograd_convolve(const Shape *s, const float *x, const float *u,
   }
 }
 
-/* So many tiles stay in a core's own cache, and each sum is loaded once for them. No
-   power of two: elements would lie in the same lines of the cache. */
+/* This many tiles fit in a core's own cache, and each sum is loaded once for them. Not
+   a power of two, so that elements do not share cache lines. */
 #define TILES 60
 
 static size_t winograd_correlate_scratch(const Shape *s) {
   return ELEMENTS * TILES * (s->channels + s->features);
 }
 
-/* u[element, c, f] += what one image and the cotangent g of its output mean for the
-   transformed kernel. */
+/* Adds the gradient of the transformed kernel for one image x, with the output's
+   cotangent g, to u[element, c, f]. */
 static void winograd_correlate(const Shape *s, const float *x, Points g, float *u,
                                float *scratch) {
   const size_t tiles = count_tiles(s), parts = (tiles + TILES - 1) / TILES;

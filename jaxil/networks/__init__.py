@@ -1,1 +1,1 @@
-"""Floor 1: flax modules, from pixels to actions, values and logits."""
+"""Flax modules, from pixels to actions, values and logits."""

@@ -10,13 +10,7 @@ from jaxil.networks.layers import MLP, Trunk
 
 
 class Actor(nn.Module):
-    """Trunk and MLP towards the mean action, before its tanh.
-
-    Attributes:
-      action_dim: A.
-      feature_dim: D, size of the trunk's output.
-      hidden_dim: width of the MLP.
-      dtype: see `Trunk`.
+    """Trunk and MLP that compute the mean action before its tanh.
 
     Source: facebookresearch/drqv2, drqv2.py, `Actor`.
     """
@@ -35,5 +29,5 @@ class Actor(nn.Module):
         return self.head(self.features(representation))
 
     def features(self, representation: Array) -> Array:
-        """Maps [B, R] to the trunk's features, [B, D]: P-SIL's metric space."""
+        """Maps [B, R] to the trunk's features, [B, D], which P-SIL compares."""
         return self.trunk(representation)

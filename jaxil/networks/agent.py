@@ -1,4 +1,4 @@
-"""Encoder, actor and critic together: the networks of one agent."""
+"""The networks of an agent: encoder, actor and critic."""
 
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ from jaxil.networks.encoder import PixelEncoder, StateEncoder
 
 
 class AgentNetworks(NamedTuple):
-    """The three modules; their parameters live in the learner's state."""
+    """The three modules; their parameters are in the learner's state."""
 
     encoder: PixelEncoder | StateEncoder
     actor: Actor
@@ -35,32 +35,15 @@ def make_agent_networks(
 ) -> AgentNetworks:
     """Returns the networks of DrQ-v2.
 
-    Args:
-      action_dim: A.
-      feature_dim: D, output of both trunks.
-      hidden_dim: width of the actor's and the critics' MLPs.
-      observation: "pixels" or "state".
-      channels: of the convolutions, as are the next two.
-      kernel_sizes: see `PixelEncoder`.
-      strides: see `PixelEncoder`.
-      contrast: see `PixelEncoder`.
-      mean: see `PixelEncoder`.
-      compute_dtype: "float32" or "bfloat16", of the convolutions and of the product
-        that follows them.
-      native: see `PixelEncoder`.
+    `observation` is "pixels" or "state". `compute_dtype` is "float32" or "bfloat16",
+    for the convolutions and the product after them. See `PixelEncoder` for the others.
     """
     dtype = jnp.dtype(compute_dtype)
     if observation == "state":
         encoder = StateEncoder(hidden_dim)
     else:
         encoder = PixelEncoder(
-            channels,
-            kernel_sizes,
-            strides,
-            contrast,
-            mean,
-            dtype,
-            native,
+            channels, kernel_sizes, strides, contrast, mean, dtype, native
         )
     return AgentNetworks(
         encoder=encoder,
@@ -70,7 +53,7 @@ def make_agent_networks(
 
 
 def apply(module: Any, params: Params, *inputs: Any, method: Any = None) -> Array:
-    """Returns what a module computes, as the one array that all of ours return."""
+    """Applies a module that returns one array."""
     return module.apply(params, *inputs, method=method)
 
 
@@ -80,7 +63,7 @@ def actor_features(
     actor_params: Params,
     observation: Array,
 ) -> Array:
-    """Returns trunk features of the actor. [B, H, W, C] to [B, D]."""
+    """Returns the features of the actor's trunk: [B, H, W, C] to [B, D]."""
     representation = apply(networks.encoder, encoder_params, observation)
     actor = networks.actor
     return apply(actor, actor_params, representation, method=actor.features)
@@ -92,7 +75,7 @@ def critic_features(
     critic_params: Params,
     observation: Array,
 ) -> Array:
-    """Returns trunk features of the critic. [B, H, W, C] to [B, D]."""
+    """Returns the features of the critic's trunk: [B, H, W, C] to [B, D]."""
     representation = apply(networks.encoder, encoder_params, observation)
     critic = networks.critic
     return apply(critic, critic_params, representation, method=critic.features)

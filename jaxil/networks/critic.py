@@ -11,12 +11,7 @@ from jaxil.networks.layers import MLP, Trunk
 
 
 class Critic(nn.Module):
-    """Two Q-functions that share a trunk of their own; the action joins after it.
-
-    Attributes:
-      feature_dim: D, size of the trunk's output.
-      hidden_dim: width of both MLPs.
-      dtype: see `Trunk`.
+    """Two Q-functions of an action and the features of a shared trunk.
 
     Source: facebookresearch/drqv2, drqv2.py, `Critic`.
     """
@@ -35,7 +30,7 @@ class Critic(nn.Module):
         return self.values(self.features(representation), action)
 
     def features(self, representation: Array) -> Array:
-        """Maps [B, R] to the trunk's features, [B, D]: what P-DAC discriminates."""
+        """Maps [B, R] to the trunk's features, [B, D], which P-DAC discriminates."""
         return self.trunk(representation)
 
     def values(self, features: Array, action: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Tells the expert from the agent: on features, or on pixels of its own."""
+"""Discriminators between expert and agent: on features, or on pixels."""
 
 from typing import Any
 
@@ -10,29 +10,21 @@ from jaxil.networks.layers import MLP, Trunk
 
 
 class Discriminator(nn.Module):
-    """MLP from features (and actions, where the method sees them) to one logit.
+    """MLP from features (and actions, if the method sees them) to one logit.
 
-    Attributes:
-      hidden_dim: width of both hidden layers.
-
-    Source: siddhanthaldar/ROT, agent/dac.py; the paper does not give it.
+    Source: siddhanthaldar/ROT, agent/dac.py; the paper does not describe it.
     """
 
     hidden_dim: int
 
     @nn.compact
     def __call__(self, inputs: Array) -> Array:
-        """Maps [B, D] to logits [B], positive where it looks like the expert."""
+        """Maps [B, D] to logits [B], positive for the expert."""
         return MLP(self.hidden_dim, 1)(inputs)[:, 0]
 
 
 class Embedding(nn.Module):
-    """Observations to a few bounded features, by an encoder and a trunk of its own.
-
-    Attributes:
-      encoder: maps [B, H, W, C], or [B, S], to [B, R].
-      feature_dim: D.
-    """
+    """Separate encoder and trunk, from observations to a few bounded features."""
 
     encoder: Any
     feature_dim: int
@@ -44,14 +36,9 @@ class Embedding(nn.Module):
 
 
 class PixelDiscriminator(nn.Module):
-    """Discriminator of pixels and actions that shares nothing with the agent.
+    """Discriminator of pixels and actions, separate from the agent's networks.
 
-    Attributes:
-      encoder: see `Embedding`.
-      feature_dim: D.
-      hidden_dim: width of both hidden layers.
-
-    Source: Cohen et al. 2021, sec. 4.1, the DAC baseline; its sizes are the agent's.
+    Source: Cohen et al. 2021, sec. 4.1, the DAC baseline; same sizes as the agent.
     """
 
     encoder: Any

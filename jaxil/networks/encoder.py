@@ -1,4 +1,4 @@
-"""From observations to the representation that actor and critic share."""
+"""Encoders of the observation, which actor and critic share."""
 
 from typing import Any
 
@@ -17,16 +17,13 @@ class PixelEncoder(nn.Module):
         x = contrast * (pixels / 255 - mean)
 
     Attributes:
-      channels: output channels of each layer.
-      kernel_sizes: side of each layer's square kernel.
-      strides: stride of each layer.
+      channels, kernel_sizes, strides: of each layer.
       contrast: factor on the centred pixels; 1 in the paper.
-      mean: what is subtracted, in [0, 1]: 0.5 in the paper, or an image
-        [H, W, C] as nested tuples or an array.
-      dtype: of the convolutions; parameters are float32 whatever it is.
-      native: whether `encoding.encode` computes it, which takes float32, channels in
-        multiples of 32 and one derivative. It takes pixels as they are stored; others
-        go the usual way.
+      mean: in [0, 1]: 0.5 in the paper, or an image [H, W, C] as nested tuples or an
+        array.
+      dtype: of the convolutions; parameters are always float32.
+      native: whether `encoding.encode` is used for uint8 pixels. It supports float32,
+        channels in multiples of 32, and first derivatives.
 
     Source: facebookresearch/drqv2, drqv2.py, `Encoder`.
     """
@@ -68,16 +65,13 @@ class PixelEncoder(nn.Module):
 
 
 class StateEncoder(nn.Module):
-    """One hidden layer for state vectors: for experts that learn without pixels.
+    """One hidden layer for state vectors, used to train experts.
 
         x = relu(W sign(s) log(1 + |s|) + b)
 
-    The trunk's LayerNorm would take the scale away from a vector that went straight
-    into it, and with it whether a joint turns at 10 or at 20 rad/s. Velocities are an
-    order of magnitude larger than positions, hence the logarithm.
-
-    Attributes:
-      hidden_dim: R, size of the representation.
+    Without it the trunk's LayerNorm would remove the scale of the state, such as
+    whether a joint turns at 10 or at 20 rad/s. The logarithm is there because
+    velocities are an order of magnitude larger than positions.
     """
 
     hidden_dim: int

@@ -1,4 +1,4 @@
-"""Building blocks that several networks share."""
+"""Layers that several networks share."""
 
 import math
 from typing import Any
@@ -15,12 +15,9 @@ _LAYER_NORM_EPSILON = 1e-5  # PyTorch's default; flax's own is 1e-6
 
 
 def dense(features: int, name: str | None = None, dtype: Any = jnp.float32) -> nn.Dense:
-    """Returns a linear layer, orthogonal with gain 1 and bias 0.
+    """Returns a linear layer with orthogonal initial weights (gain 1) and zero bias.
 
-    Args:
-      features: size of the output.
-      name: of its parameters.
-      dtype: of the product; parameters are float32 whatever it is.
+    `dtype` is that of the product; parameters are always float32.
 
     Source: facebookresearch/drqv2, utils.py, `weight_init`.
     """
@@ -34,13 +31,10 @@ def dense(features: int, name: str | None = None, dtype: Any = jnp.float32) -> n
 
 
 class ConvolutionReLU(nn.Module):
-    """A VALID convolution with ReLU, orthogonal with the gain of ReLU, and bias 0.
+    """A VALID convolution with ReLU and a square kernel.
 
-    Attributes:
-      features: F, output channels.
-      kernel_size: side of the square kernel.
-      stride: along both sides.
-      dtype: of the convolution; parameters are float32 whatever it is.
+    Initial weights are orthogonal with the gain of ReLU, biases zero. `dtype` is that
+    of the convolution; parameters are always float32.
 
     Source: facebookresearch/drqv2, utils.py, `weight_init`.
     """
@@ -52,7 +46,7 @@ class ConvolutionReLU(nn.Module):
 
     @nn.compact
     def weights(self, channels: int) -> Weights:
-        """Returns the parameters for images of so many channels."""
+        """Returns the parameters for images with this number of channels."""
         shape = (self.kernel_size, self.kernel_size, channels, self.features)
         gain = nn.initializers.orthogonal(scale=math.sqrt(2.0))
         kernel = self.param("kernel", gain, shape)
@@ -69,13 +63,11 @@ class ConvolutionReLU(nn.Module):
 
 
 class Trunk(nn.Module):
-    """Squeezes a representation into a few bounded features.
+    """Maps a representation to a few bounded features.
 
         h = tanh(LayerNorm(W x + b))
 
-    Attributes:
-      feature_dim: D, number of features.
-      dtype: of the product W x, the learner's largest; the rest is float32.
+    `dtype` is that of W x, the learner's largest product; the rest is float32.
 
     Source: facebookresearch/drqv2, drqv2.py, `Actor.trunk`, `Critic.trunk`.
     """
@@ -94,12 +86,7 @@ class Trunk(nn.Module):
 
 
 class MLP(nn.Module):
-    """Two hidden ReLU layers and a linear output.
-
-    Attributes:
-      hidden_dim: width of both hidden layers.
-      output_dim: width of the output.
-    """
+    """Two hidden ReLU layers and a linear output."""
 
     hidden_dim: int
     output_dim: int

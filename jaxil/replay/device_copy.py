@@ -1,6 +1,6 @@
-"""A copy of the replay's frames on the device, so that only indices travel there.
+"""A device copy of the replay's frames, so that batches are sent as indices.
 
-The NumPy ring stays what is saved and what is read back; the copy follows it.
+Checkpoints are still written from the NumPy ring.
 """
 
 import functools
@@ -11,25 +11,20 @@ import numpy as np
 
 from jaxil.replay.replay import Replay
 
-# One size for all writes, so that they compile once; 1.4 MB of the paper's frames.
+# All writes have this size, so that they compile once; 1.4 MB of the paper's frames.
 _BLOCK_FRAMES = 64
 
 
 class DeviceCopy:
-    """Holds the frames of a replay's ring in one array on jax's default device.
+    """Holds the frames of a replay in one array on jax's default device.
 
     Attributes:
-      frames: like `Replay.frames`, equal to it wherever an episode is stored. A
-        `refresh` replaces and deletes it: read it afresh for each use.
+      frames: equals `Replay.frames` wherever an episode is stored. Each `refresh`
+        replaces and deletes it, so do not keep it.
     """
 
     def __init__(self, replay: Replay, *, block_frames: int = _BLOCK_FRAMES) -> None:
-        """Reserves the device's memory and copies what is stored already.
-
-        Args:
-          replay: not to be cleared from now on.
-          block_frames: frames that are sent at a time, >= 1.
-        """
+        """Copies a replay, which must not be cleared from now on."""
         self._replay = replay
         self._block_frames = min(block_frames, len(replay.frames))
         self._num_episodes = 0
@@ -42,16 +37,16 @@ class DeviceCopy:
         for index in self._replay.episodes:
             if index < self._num_episodes:
                 continue
-            # Whole blocks of the ring: their other frames are sent as they were.
+            # Whole blocks of the ring, with frames that are unchanged.
             for block in np.unique(self._replay.slots(index) // size):
                 first = min(block * size, len(ring) - size)
-                # A copy, because jax may go on reading after the ring has changed.
+                # A copy, since jax may still read it after the ring has changed.
                 frames = np.array(ring[first : first + size])
                 self.frames = _write(self.frames, frames, np.int32(first))
         self._num_episodes = self._replay.num_episodes_added
 
 
-# The array is donated: it is written to in place, not copied whole.
+# Donating the array makes XLA write to it in place.
 @functools.partial(jax.jit, donate_argnums=0)
 def _write(frames: jax.Array, block: jax.Array, first: jax.Array) -> jax.Array:
     return jax.lax.dynamic_update_slice_in_dim(frames, block, first, axis=0)

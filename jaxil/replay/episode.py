@@ -1,31 +1,14 @@
-"""An episode as the replay stores it, and what may be stored.
-
-Axes: T steps of an episode, H W C pixels, S numbers of a state.
-"""
-
-from typing import NamedTuple
+"""Checks of what is stored in the replay."""
 
 import numpy as np
 
-
-class Episode(NamedTuple):
-    """One episode as it is stored."""
-
-    frames: np.ndarray  # [T + 1, H, W, C] uint8 or [T + 1, S] float32
-    actions: np.ndarray  # [T, A] float32
-    rewards: np.ndarray  # [T] float32: rewards[t] belongs to (o_t, a_t, o_{t+1})
-    discounts: np.ndarray  # [T] float32: the environment's own, 0 after a true end
+from jaxil.maths.types import Episode
 
 
 def checked_episode(frames, actions, rewards, discounts, *, like: Episode) -> Episode:
-    """Returns arrays of one episode in the types that are stored.
+    """Returns the arrays of an episode, converted to the dtypes of `like`.
 
-    Args:
-      frames: see `Episode`; its dtype is not changed.
-      actions: real numbers, finite, as are the next two.
-      rewards: see `Episode`.
-      discounts: in [0, 1].
-      like: arrays of the right dtypes and of the right shapes behind the first axis.
+    Frames are not converted. Only the first axis may differ from `like`.
 
     Raises:
       ValueError: for a wrong shape or dtype, or a number that is out of range.
@@ -53,12 +36,7 @@ def checked_episode(frames, actions, rewards, discounts, *, like: Episode) -> Ep
 
 
 def checked_values(name: str, values, like: np.ndarray) -> np.ndarray:
-    """Returns finite real numbers in the type that is stored.
-
-    Args:
-      name: what an error calls them.
-      values: array, or what becomes one.
-      like: an array of the shape and the dtype that are expected.
+    """Returns finite real numbers, converted to the dtype of `like`.
 
     Raises:
       ValueError: for a wrong shape or dtype, or a number that is not finite.
@@ -67,14 +45,14 @@ def checked_values(name: str, values, like: np.ndarray) -> np.ndarray:
     require(values.shape == like.shape, f"{name}.shape", values.shape, like.shape)
     real = values.dtype.kind in "fiu"
     require(real, f"{name}.dtype", values.dtype, "real numbers")
-    with np.errstate(over="ignore"):  # becomes inf, which is refused below
+    with np.errstate(over="ignore"):  # it becomes inf, which is refused below
         values = values.astype(like.dtype)
     _require_all(np.isfinite(values), name, values, "finite")
     return values
 
 
 def require(condition: bool, name: str, value: object, rule: object) -> None:
-    """Raises a ValueError that says which rule a value breaks, unless it holds."""
+    """Raises a ValueError unless the condition holds."""
     if not condition:
         raise ValueError(f"{name} = {value}: expected {rule}")
 

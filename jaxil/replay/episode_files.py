@@ -1,4 +1,4 @@
-"""Stored episodes as files, DIR/episode_00000012.npz: written once, never changed."""
+"""Episodes as files DIR/episode_00000012.npz, which are written once."""
 
 import pathlib
 import re
@@ -7,11 +7,11 @@ import zipfile
 import numpy as np
 
 from jaxil.files import archive, writing
-from jaxil.replay.episode import Episode
+from jaxil.maths.types import Episode
 from jaxil.replay.replay import Replay
 
 _NAME = re.compile(r"episode_(\d{8,})\.npz")
-# The episode's number in its own file, so that exchanged files are noticed. Files of
+# The file contains the episode's number, so that swapped files are noticed. Files of
 # earlier versions lack it.
 _NUMBER = "number"
 
@@ -19,7 +19,7 @@ _NUMBER = "number"
 def write(folder: pathlib.Path, replay: Replay, index: int) -> None:
     """Writes one stored episode."""
     arrays = {**replay.episode(index)._asdict(), _NUMBER: np.int64(index)}
-    # np.savez_compressed packs at level 6: slower by far, little smaller.
+    # np.savez_compressed uses level 6: far slower, hardly smaller.
     with (
         writing.replacing(_path(folder, index)) as temporary,
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file,
@@ -32,10 +32,10 @@ def write(folder: pathlib.Path, replay: Replay, index: int) -> None:
 
 
 def read_into(replay: Replay, folder: pathlib.Path, index: int) -> str | None:
-    """Adds one episode, or skips its number if its file is damaged.
+    """Adds one episode, or skips its number if the file is damaged.
 
     Returns:
-      What is wrong with the file; None if it was added.
+      What is wrong with the file, or None.
     """
     path = _path(folder, index)
     try:

@@ -1,7 +1,7 @@
 """The replay: a NumPy ring of single frames, from which n-step windows are sampled.
 
-Each frame is stored once and stacks are made when they are sampled, so that the paper's
-150000 steps of 84x84 pixels take 3.2 GB (stored stacks would take 9.5 GB).
+Each frame is stored once and stacks are assembled when they are sampled: the paper's
+150000 steps of 84x84 pixels take 3.2 GB instead of 9.5 GB.
 
 Axes: B batch, T steps of an episode, n the length of a window, H W C pixels.
 """
@@ -17,12 +17,7 @@ from jaxil.replay.stacking import gather_stacks
 
 
 def memory_bytes(*, action_dim: int, **sizes) -> int:
-    """Returns how much memory a full replay takes, in bytes.
-
-    Args:
-      action_dim: A.
-      **sizes: see `frames_bytes`.
-    """
+    """Returns the size of a full replay; see `frames_bytes` for `sizes`."""
     slots = ring_slots(sizes["capacity_steps"], sizes["episode_steps"])
     return frames_bytes(**sizes) + slots * 4 * (action_dim + 2)
 
@@ -34,14 +29,7 @@ def frames_bytes(
     observation_shape: tuple[int, ...],
     observation_dtype,
 ) -> int:
-    """Returns how much of it is frames, of which a device may hold a copy.
-
-    Args:
-      capacity_steps: transitions kept at most.
-      episode_steps: transitions of a usual episode.
-      observation_shape: shape of a single frame, (H, W, C), or of a state, (S,).
-      observation_dtype: dtype of a frame.
-    """
+    """Returns the size of its frames and thus of a device copy; see `EpisodeRing`."""
     frame_bytes = math.prod(observation_shape) * np.dtype(observation_dtype).itemsize
     return ring_slots(capacity_steps, episode_steps) * frame_bytes
 
@@ -52,16 +40,16 @@ class Replay(EpisodeRing):
     def __init__(
         self, *, frame_stack: int, num_steps: int, discount_factor: float, **sizes
     ):
-        """Reserves the memory.
+        """Allocates the memory.
 
         Args:
           frame_stack: frames in an observation, >= 1; 1 for states.
-          num_steps: n >= 1, the steps that a sampled transition spans.
+          num_steps: n of the n-step return, >= 1.
           discount_factor: gamma in [0, 1].
           **sizes: see `EpisodeRing`.
 
         Raises:
-          ValueError: if a number breaks its rule.
+          ValueError: for a number that is out of range.
         """
         super().__init__(**sizes)
         require(frame_stack >= 1, "frame_stack", frame_stack, ">= 1")
@@ -75,7 +63,7 @@ class Replay(EpisodeRing):
         self._discount_factor = discount_factor
 
     def can_sample(self) -> bool:
-        """Returns whether any stored episode has a window of n steps."""
+        """Returns whether any stored episode has at least n steps."""
         return bool(self._num_windows().any())
 
     def sample(
@@ -90,17 +78,13 @@ class Replay(EpisodeRing):
 
         reward = sum_{k<n} gamma^k d_t ... d_{t+k-1} r_{t+k}, and
         discount = gamma^n d_t ... d_{t+n-1}, with d the environment's discounts.
-        Windows stay within their episode, and so do stacks: frame 0 is repeated at its
-        start.
+        Windows and stacks stay within their episode; frame 0 is repeated at its start.
 
         Args:
-          rng: it is advanced by one call.
+          rng: advanced by one call.
           batch_size: B >= 1.
-          windows: whether to add all of each window's transitions.
+          windows: whether to add all transitions of each window.
           successors: whether to add o_{t+1}.
-
-        Returns:
-          A batch of fresh arrays in C order.
 
         Raises:
           ValueError: if no stored episode is as long as a window.
@@ -108,25 +92,7 @@ class Replay(EpisodeRing):
         batch = self.sample_indices(
             rng, batch_size, windows=windows, successors=successors
         )
-        # All stacks in one call, which shares the work out among threads.
-        parts = [batch.observation[None], batch.next_observation[None]]
-        if batch.successor is not None:
-            parts.append(batch.successor[None])
-        if batch.window is not None:
-            parts.append(batch.window.observation.swapaxes(0, 1))
-        slots = np.concatenate(parts)
-        stacks = gather_stacks(self._frames, slots.reshape(-1, self._frame_stack))
-        stacks = stacks.reshape(*slots.shape[:2], *stacks.shape[1:])
-        window = batch.window
-        if window is not None:
-            inside = stacks[-self._window :].swapaxes(0, 1)
-            window = window._replace(observation=np.ascontiguousarray(inside))
-        return batch._replace(
-            observation=stacks[0],
-            next_observation=stacks[1],
-            successor=None if batch.successor is None else stacks[2],
-            window=window,
-        )
+        return batch.map_observations(lambda each: gather_stacks(self._frames, each))
 
     def sample_indices(
         self,
@@ -136,15 +102,11 @@ class Replay(EpisodeRing):
         windows: bool = False,
         successors: bool = False,
     ) -> Batch:
-        """Samples what `sample` does, with indices of frames in place of pixels.
+        """Samples like `sample`, with frame indices instead of pixels.
 
         Returns:
-          A batch in which each stack [H, W, C * stack] is the int32 [stack] of its
-          frames' indices in `frames`, the oldest first. They are valid until the next
-          episode is added.
-
-        Raises:
-          ValueError: if no stored episode is as long as a window.
+          A batch whose observations are the int32 [stack] indices of their frames in
+          `frames`, oldest first. They are valid until the next episode is added.
         """
         num_windows = self._num_windows()
         if not num_windows.any():
@@ -152,7 +114,7 @@ class Replay(EpisodeRing):
                 f"num_steps_stored = {self._num_steps_stored}: expected an episode of"
                 f" at least {self._window} steps; add one before sampling"
             )
-        # Laid end to end, so that one number picks an episode and a time t in it.
+        # Windows are numbered consecutively, so one number gives episode and time t.
         ends = np.cumsum(num_windows)
         flat = rng.integers(int(ends[-1]), size=batch_size)
         which = np.searchsorted(ends, flat, side="right")
@@ -164,7 +126,7 @@ class Replay(EpisodeRing):
         rewards = self._rewards[slots].astype(np.float64)
         discounts = self._discount_factor * self._discounts[slots].astype(np.float64)
         discounts = np.cumprod(discounts, axis=1)
-        # A reward is discounted by what lies before it, not by its own step's discount.
+        # A reward is discounted by the steps before it, not by its own.
         weights = np.concatenate([np.ones((batch_size, 1)), discounts[:, :-1]], axis=1)
 
         window = None
@@ -190,9 +152,9 @@ class Replay(EpisodeRing):
         return np.maximum(self._lengths - self._window + 1, 0)
 
     def _stack_slots(self, starts: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        """Returns the slots of each o_t's frames, for episodes that begin at `starts`.
+        """Returns the slots of each o_t's stack as a new last axis, oldest first.
 
-        They are int32, along a new last axis, the oldest first.
+        `starts` are the first slots of the episodes.
         """
         ages = np.arange(self._frame_stack)[::-1]
         slots = starts[..., None] + np.maximum(steps[..., None] - ages, 0)

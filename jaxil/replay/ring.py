@@ -1,16 +1,12 @@
-"""A ring of NumPy arrays that keeps the newest whole episodes.
-
-Each frame is stored once. Whole episodes enter, and the oldest whole episodes leave.
-
-Axes: T steps of an episode, H W C pixels.
-"""
+"""A ring of NumPy arrays that keeps the newest whole episodes."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxil.replay.episode import Episode, checked_episode, checked_values, require
+from jaxil.maths.types import Episode
+from jaxil.replay.episode import checked_episode, checked_values, require
 
 
 class _Stored(NamedTuple):
@@ -21,8 +17,8 @@ class _Stored(NamedTuple):
 class EpisodeRing:
     """Stores the newest episodes, numbered in the order in which they were added.
 
-    The next free slot follows the newest frame, modulo the ring's length; an episode
-    may run over the ring's end. A slot holds o_t with the a_t, r_t and d_t that follow.
+    The next free slot follows the newest frame, modulo the ring's length, so an episode
+    may wrap around. Slots hold o_t with the a_t, r_t and d_t that follow.
     """
 
     def __init__(
@@ -34,17 +30,17 @@ class EpisodeRing:
         observation_dtype,
         action_dim: int,
     ):
-        """Reserves the memory, which the system hands out as it is written to.
+        """Allocates the memory.
 
         Args:
-          capacity_steps: transitions kept at most, >= episode_steps.
-          episode_steps: transitions of a usual episode (see `ring_slots`), >= 1.
-          observation_shape: shape of a single frame, (H, W, C), or of a state, (S,).
+          capacity_steps: transitions to keep, >= episode_steps.
+          episode_steps: transitions of a usual episode, >= 1.
+          observation_shape: of a single frame, (H, W, C), or of a state, (S,).
           observation_dtype: uint8 for pixels, float32 for states.
           action_dim: A >= 1.
 
         Raises:
-          ValueError: if a number breaks its rule.
+          ValueError: for a number that is out of range.
         """
         shape = tuple(observation_shape)
         require(episode_steps >= 1, "episode_steps", episode_steps, ">= 1")
@@ -56,7 +52,7 @@ class EpisodeRing:
         )
         self._capacity_steps = capacity_steps
         slots = ring_slots(capacity_steps, episode_steps)
-        # np.empty and np.zeros touch no page yet: memory use grows with the run.
+        # These touch no pages yet, so memory use grows with the run.
         self._frames = np.empty((slots, *shape), observation_dtype)
         self._actions = np.zeros((slots, action_dim), np.float32)
         self._rewards = np.zeros(slots, np.float32)
@@ -64,7 +60,7 @@ class EpisodeRing:
         self.clear()
 
     def clear(self, first_episode: int = 0) -> None:
-        """Forgets all episodes; the next one added gets the number `first_episode`."""
+        """Removes all episodes; the next one gets the number `first_episode`."""
         self._stored: dict[int, _Stored] = {}  # by number, the oldest first
         self._num_episodes_added = first_episode
         self._num_steps_stored = 0
@@ -73,47 +69,41 @@ class EpisodeRing:
 
     @property
     def frames(self) -> np.ndarray:
-        """The ring of frames itself, read-only: [num_slots, H, W, C] or [.., S]."""
+        """The ring of frames, read-only: [num_slots, H, W, C] or [num_slots, S]."""
         ring = self._frames.view()
         ring.flags.writeable = False
         return ring
 
     @property
     def num_steps_stored(self) -> int:
-        """Transitions in the replay now."""
+        """Transitions in the replay."""
         return self._num_steps_stored
 
     @property
     def episodes(self) -> list[int]:
-        """Numbers of the stored episodes, rising; some may be missing in between."""
+        """Numbers of the stored episodes, increasing, perhaps with gaps."""
         return list(self._stored)
 
     @property
     def num_episodes_added(self) -> int:
-        """Episodes ever added, or skipped; the next one gets this number."""
+        """Episodes added or skipped so far: the number of the next one."""
         return self._num_episodes_added
 
     @property
     def oldest_episode(self) -> int:
-        """Number of the oldest stored episode; of the next one if there is none."""
+        """Number of the oldest stored episode, or of the next one if there is none."""
         return next(iter(self._stored), self._num_episodes_added)
 
     def skip_episode(self) -> None:
-        """Leaves out the next number: its episode has been lost."""
+        """Skips the next number, whose episode has been lost."""
         self._num_episodes_added += 1
 
     def add_episode(self, *, frames, actions, rewards, discounts) -> None:
-        """Copies one whole episode in; the oldest ones make room for it.
-
-        Args:
-          frames: [T + 1, H, W, C] uint8, or [T + 1, S] float32: o_0 ... o_T, unstacked.
-          actions: [T, A] float, finite: actions[t] was taken on seeing o_t.
-          rewards: [T] float, finite: rewards[t] came with o_{t+1}.
-          discounts: [T] float in [0, 1]: 0 after a true end, 1 at a time limit.
+        """Copies a whole episode, see `Episode`, and removes the oldest if necessary.
 
         Raises:
           ValueError: for a wrong shape or dtype, a number that is not finite, or an
-            episode that is longer than the replay; nothing is changed then.
+            episode that is longer than the replay, which is unchanged then.
         """
         like = Episode(self._frames, self._actions, self._rewards, self._discounts)
         frames, actions, rewards, discounts = checked_episode(
@@ -132,7 +122,7 @@ class EpisodeRing:
         ):
             self._num_steps_stored -= self._stored.pop(self.oldest_episode).num_steps
         start = self._next_slot
-        # In two pieces where the ring ends: slices copy faster than index lists.
+        # In two pieces if it wraps around: slices copy faster than index lists.
         head = min(num_steps + 1, length - start)
         self._frames[start : start + head] = frames[:head]
         self._frames[: num_steps + 1 - head] = frames[head:]
@@ -147,39 +137,30 @@ class EpisodeRing:
         self._index_episodes()
 
     def replace_rewards(self, index: int, rewards) -> None:
-        """Replaces the rewards of one stored episode.
-
-        Args:
-          index: its number.
-          rewards: [T] float, finite, for the T steps that the episode has.
+        """Replaces the rewards [T] of a stored episode.
 
         Raises:
           IndexError: if it is not stored.
-          ValueError: for a wrong shape or dtype, or a number that is not finite;
-            nothing is changed then.
+          ValueError: for a wrong shape or dtype, or a number that is not finite.
         """
         slots = self.slots(index)[:-1]
         self._rewards[slots] = checked_values("rewards", rewards, self._rewards[slots])
 
     def rewards(self, index: int) -> np.ndarray:
-        """Returns a copy of the rewards of one stored episode, [T]."""
+        """Returns a copy of the rewards of a stored episode, [T]."""
         return self._rewards[self.slots(index)[:-1]]
 
     def actions(self, index: int) -> np.ndarray:
-        """Returns a copy of the actions of one stored episode, [T, A]."""
+        """Returns a copy of the actions of a stored episode, [T, A]."""
         return self._actions[self.slots(index)[:-1]]
 
     def mean_reward(self) -> float:
-        """Returns the mean of all stored rewards; NaN without any."""
+        """Returns the mean of all stored rewards; NaN if there are none."""
         total = sum(self.rewards(i).sum(dtype=np.float64) for i in self._stored)
         return float(total / self._num_steps_stored) if self._stored else math.nan
 
     def episode(self, index: int) -> Episode:
-        """Returns a copy of one stored episode.
-
-        Raises:
-          IndexError: if it is not stored.
-        """
+        """Returns a copy of a stored episode; IndexError if it is not stored."""
         slots = self.slots(index)
         return Episode(
             frames=self._frames[slots],
@@ -189,11 +170,7 @@ class EpisodeRing:
         )
 
     def slots(self, index: int) -> np.ndarray:
-        """Returns where in `frames` those of a stored episode are, [T + 1].
-
-        Raises:
-          IndexError: if it is not stored.
-        """
+        """Returns an episode's indices in `frames`, [T + 1], or raises IndexError."""
         if index not in self._stored:
             raise IndexError(
                 f"episode {index} is not stored: the replay holds"
@@ -204,11 +181,11 @@ class EpisodeRing:
         return (start + np.arange(num_steps + 1)) % len(self._frames)
 
     def _index_episodes(self) -> None:
-        """Keeps first slot and steps of each episode as arrays, for sampling."""
+        """Updates the arrays of first slots and lengths, for sampling."""
         table = np.array(list(self._stored.values()), np.int64).reshape(-1, 2)
         self._starts, self._lengths = table.T
 
 
 def ring_slots(capacity_steps: int, episode_steps: int) -> int:
-    """Returns the frames that a ring has room for: one more than steps per episode."""
+    """Returns the slots of a ring: each episode has one frame more than steps."""
     return capacity_steps + math.ceil(capacity_steps / episode_steps)

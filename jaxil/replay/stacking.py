@@ -1,12 +1,12 @@
-"""Stacks of frames, put together where they are needed."""
+"""Stacks of frames, assembled on the host."""
 
 import concurrent.futures
 import os
 
 import numpy as np
 
-# Interleaving is memory traffic: it goes in blocks that stay in a core's cache, and
-# only more bytes than the second number are worth handing to other threads.
+# Interleaving is bound by memory: blocks stay in a core's cache, and other threads only
+# help beyond the second number.
 _BLOCK_BYTES = 2**21
 _PARALLEL_BYTES = 2**22
 _THREADS = concurrent.futures.ThreadPoolExecutor(
@@ -19,14 +19,16 @@ def gather_stacks(frames: np.ndarray, indices: np.ndarray) -> np.ndarray:
 
     Args:
       frames: [N, H, W, C], or [N, S] if K is 1.
-      indices: [B, K] numbers in [0, N): the frames of each stack, the oldest first.
+      indices: [..., K], in [0, N): the frames of each stack, oldest first.
 
     Returns:
-      A fresh array [B, H, W, K * C], or [B, S], in C order.
+      A new array [..., H, W, K * C], or [..., S], in C order.
     """
-    batch_size, num_stacked = indices.shape
+    *axes, num_stacked = indices.shape
     if num_stacked == 1:
-        return frames[indices[:, 0]]
+        return frames[indices[..., 0]]
+    indices = indices.reshape(-1, num_stacked)
+    batch_size = len(indices)
     height, width, channels = frames.shape[1:]
     pixels = frames.reshape(len(frames), height * width, channels)
     stacks = np.empty(
@@ -34,13 +36,14 @@ def gather_stacks(frames: np.ndarray, indices: np.ndarray) -> np.ndarray:
     )
 
     def fill(block: slice) -> None:
-        for place in range(num_stacked):
-            gathered = pixels[indices[block, place]]
-            # One strided copy for each channel: NumPy's inner loop then runs along
-            # the pixels. Copying whole pixels makes inner loops of C bytes (4 times
-            # slower).
+        for position in range(num_stacked):
+            gathered = pixels[indices[block, position]]
+            # One strided copy per channel, so that NumPy's inner loop runs along the
+            # pixels: 4 times faster than inner loops of C bytes.
             for channel in range(channels):
-                stacks[block, :, place * channels + channel] = gathered[:, :, channel]
+                stacks[block, :, position * channels + channel] = gathered[
+                    :, :, channel
+                ]
 
     size = max(1, _BLOCK_BYTES // max(1, stacks[:1].nbytes))
     blocks = [slice(first, first + size) for first in range(0, batch_size, size)]
@@ -49,4 +52,4 @@ def gather_stacks(frames: np.ndarray, indices: np.ndarray) -> np.ndarray:
     else:
         for block in blocks:
             fill(block)
-    return stacks.reshape(batch_size, height, width, num_stacked * channels)
+    return stacks.reshape(*axes, height, width, num_stacked * channels)

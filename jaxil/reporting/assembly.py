@@ -1,14 +1,14 @@
-"""The report from top to bottom: sections, in the order in which they are read."""
+"""The report: all figures and tables of some runs, and their page."""
 
 import pathlib
 from collections.abc import Sequence
 
-from jaxil.reporting import episodes, groups, paper, results, summary
+from jaxil.reporting import charts, episodes, figures, measures, page, paper, tables
 from jaxil.reporting import folder as folders
-from jaxil.reporting.page import Page
+from jaxil.reporting.groups import Group, make_groups, short, tasks_of
+from jaxil.reporting.remarks import remarks
 from jaxil.reporting.runs import Run
-from jaxil.reporting.sheets import Sheet, write
-from jaxil.reporting.tables import Table, to_csv
+from jaxil.reporting.sheets import write
 
 
 def write_report(
@@ -16,7 +16,7 @@ def write_report(
     output: pathlib.Path,
     *,
     unreadable: list[str],
-    num_seeds: int,
+    num_seeds: int | None,
     num_videos: int,
 ) -> None:
     """Writes index.html, figures/ and tables/ into a new folder.
@@ -24,119 +24,95 @@ def write_report(
     Args:
       runs: at least one.
       output: where; an older report there is replaced as a whole.
-      unreadable: sentences about folders that hold no run that can be read.
-      num_seeds: how many seeds each variant should have, at least 1.
-      num_videos: how many of each variant to show, at least 0.
+      unreadable: sentences about runs that cannot be read.
+      num_seeds: how many seeds each variant should have; None if nobody asked.
+      num_videos: how many of each variant to show.
 
     Raises:
-      OSError: if it can't be written.
+      OSError: it cannot be written.
     """
-    study = results.make_study(groups.make_groups(runs))
-    page = Page("Imitation from pixels: " + _tasks(study))
-    tables: list[Table] = []
-    drawn: list[Sheet] = []
-
-    def show(sheet: Sheet | None, missing: str) -> None:
-        page.sheet(sheet, missing)
-        drawn.extend([sheet] if sheet else [])
-
-    def tabulate(table: Table) -> None:
-        page.table(table)
-        tables.append(table)
-
-    page.section("Summary")
-    page.facts(summary.facts(study))
-    page.remarks(summary.remarks(study, unreadable))
-    page.paragraph(summary.shared_sentence(study), soft=True)
-    tabulate(summary.seed_table(study, num_seeds))
-
-    page.section("Learning curves")
-    for over, title in (("frame", "frames"), ("hours", "hours")):
-        page.heading(f"By {title}")
-        sheet, curves = results.curve_sheet(
-            study, study.groups, name=f"learning_by_{title}", over=over
-        )
-        show(sheet, "No run has an evaluation yet.")
-        tables.append(results.curve_table(f"learning_by_{title}", curves, over))
-
-    page.section("Final returns")
-    page.paragraph(
-        "The paper averages the last ten episodes. Here it is the last evaluation: as "
-        "many episodes as num_eval_episodes says, ten by default, played by the mean "
-        "action. IQM is the interquartile mean, its interval a bootstrap over seeds."
+    groups = make_groups(runs)
+    by_frames, frame_curves = charts.curve_sheet(
+        groups, name="learning_by_frames", over="frame"
     )
-    finals = results.finals(study, study.groups)
-    show(results.bar_sheet(study, finals, name="final_returns"), "No evaluation yet.")
-    tabulate(results.final_table(finals))
-    aggregate = results.aggregate_table(finals)
-    if aggregate is not None:
-        page.heading("Over all tasks, in shares of each expert")
-        page.paragraph(
-            "Seeds are resampled within each task (stratified bootstrap). Variants "
-            "that were not run on the same tasks can't be compared by these rows.",
-            soft=True,
-        )
-        tabulate(aggregate)
-
-    page.section("Distance to the expert")
-    page.paragraph(
-        "Wasserstein distance between the episodes of agent and expert; a random "
-        "policy has 1, the expert 0."
+    by_hours, hour_curves = charts.curve_sheet(
+        groups, name="learning_by_hours", over="hours"
     )
-    sheet, curves = results.curve_sheet(
-        study,
-        study.groups,
-        name="wasserstein",
-        over="frame",
-        column="wasserstein_to_expert",
+    distance, distances = charts.curve_sheet(
+        groups, name="wasserstein", over="frame", column="wasserstein_to_expert"
     )
-    show(sheet, "No run has a column wasserstein_to_expert in its eval.csv.")
-    if curves:
-        tables.append(results.curve_table("wasserstein", curves, "frame"))
-
-    page.section("Sample efficiency")
-    page.paragraph(
-        "When the first evaluation was at or above a share of the expert's return: the "
-        "share of seeds that got there, and the median over seeds, of which those that "
-        "never did count as later than all others. Frames per second are of the whole "
-        "run, evaluations included."
+    finals = [f for f in map(measures.final, groups) if f is not None]
+    films, left_out = episodes.collect(groups, num_videos)
+    sheets = {
+        "by_frames": by_frames,
+        "by_hours": by_hours,
+        "bars": charts.bar_sheet(finals, name="final_returns"),
+        "distance": distance,
+        "logits": charts.logit_sheet(groups, name="logits"),
+    }
+    on_page = [
+        tables.final_table(finals),
+        tables.aggregate_table(finals),
+        tables.efficiency_table(groups),
+        tables.seed_table(groups, num_seeds),
+        tables.settings_table(groups),
+        tables.run_table(groups),
+    ]
+    as_files = [
+        tables.curve_table("learning_by_frames", frame_curves, "frame"),
+        tables.curve_table("learning_by_hours", hour_curves, "hours"),
+        tables.curve_table("wasserstein", distances, "frame"),
+    ]
+    paper_figures = paper.paper_figures(groups, num_seeds or figures.NUM_SEEDS)
+    sentences = [*unreadable, *remarks(groups), *left_out]
+    index = page.html(
+        {
+            "heading": "Imitation from pixels: " + _tasks(groups),
+            "facts": _facts(groups, len(sentences)),
+            "shared": _shared(groups),
+            **sheets,
+            "paper": paper_figures,
+            "episodes": films,
+            "tables": on_page,
+            "remarks": sentences,
+        }
     )
-    tabulate(results.efficiency_table(study))
-
-    page.section("Runs")
-    tabulate(results.run_table(study))
-
-    page.section("Videos")
-    films, left_out = episodes.collect(study, num_videos)
-    page.remarks(left_out)
-    if films:
-        page.episodes(films)
-        drawn.extend(film.sheet for film in films if film.sheet)
-    else:
-        page.paragraph("No run has a video that can be shown.", soft=True)
-    page.heading("What the discriminator says")
-    show(
-        results.logit_sheet(study, name="logits"),
-        "No run has logits of a discriminator in its train.csv.",
-    )
-
-    page.section("The paper's figures")
-    page.paragraph(
-        "Figures of the paper by their numbers, as far as there are runs; runs with "
-        "other settings than the paper's are drawn as well, see Runs."
-    )
-    found = paper.paper_figures(study, num_seeds)
-    page.paper(found, num_seeds)
-    drawn.extend(figure.sheet for figure in found if figure.sheet)
-
+    plotted = [*sheets.values(), *(film.sheet for film in films)]
+    plotted += [figure.sheet for figure in paper_figures]
     with folders.replaced(output) as folder:
-        for sheet in drawn:
-            write(sheet, folder / "figures")
-        for table in tables:
-            (folder / "tables" / f"{table.name}.csv").write_bytes(to_csv(table))
-        (folder / "index.html").write_bytes(page.html())
+        for sheet in plotted:
+            if sheet is not None:
+                write(sheet, folder / "figures")
+        for table in (*on_page, *as_files):
+            if table.rows:
+                path = folder / "tables" / f"{table.name}.csv"
+                path.write_bytes(tables.to_csv(table))
+        (folder / "index.html").write_bytes(index)
 
 
-def _tasks(study: results.Study) -> str:
-    tasks = list(groups.tasks_of(study.groups))
+def _facts(groups: Sequence[Group], num_remarks: int) -> list[tuple[str, str]]:
+    """Returns the numbers at the head of the page, with what they count."""
+    runs = [run for group in groups for run in group.runs]
+    return [
+        (f"{len(runs)}", "runs"),
+        (f"{sum(run.is_finished for run in runs)}", "finished"),
+        (f"{len({run.task for run in runs})}", "tasks"),
+        (f"{len({run.variant.method for run in runs})}", "methods"),
+        (f"{len({run.seed for run in runs})}", "seeds"),
+        (f"{sum(run.frames for run in runs) / 1e6:.2f} M", "frames"),
+        (f"{sum(run.seconds for run in runs) / 3600:.1f}", "hours"),
+        (f"{num_remarks}", "warnings"),
+    ]
+
+
+def _shared(groups: Sequence[Group]) -> str:
+    shared = tables.shared_changes(groups)
+    if not shared:
+        return ""
+    each = ", ".join(f"{field} {short(value)}" for field, value in shared.items())
+    return f"All runs differ from the paper's settings in: {each}."
+
+
+def _tasks(groups: Sequence[Group]) -> str:
+    tasks = list(tasks_of(groups))
     return ", ".join(tasks) if len(tasks) <= 3 else f"{len(tasks)} tasks"

@@ -11,14 +11,14 @@ import numpy as np
 from jaxil.files import archive
 from jaxil.reporting import plots
 from jaxil.reporting.groups import Group
-from jaxil.reporting.results import Study
-from jaxil.reporting.runs import Run
+from jaxil.reporting.runs import LARGEST, Run, printable
 from jaxil.reporting.sheets import Panel, Sheet
 
-_NAME = re.compile(r"frame_(\d+)\.mp4")
+_NAME = re.compile(r"frame_(\d{1,12})\.mp4")
 # Browsers refuse pages of hundreds of megabytes; a suite episode has about one.
 _MAX_BYTES_EACH, _MAX_BYTES = 20_000_000, 100_000_000
 _STORED = {"imitation_rewards", "task_rewards", "plan"}  # beside a video
+_MAX_ARRAY_BYTES, _MAX_STEPS = 2**26, 100_000
 _REWARD_HEIGHT, _PLAN_HEIGHT = 1.75, 3.4  # inches
 
 
@@ -39,101 +39,122 @@ class Episode(NamedTuple):
     video: bytes
     sheet: Sheet | None
 
+    @property
+    def about(self) -> str:
+        """Which episode it is, and how good its evaluation was."""
+        parts = [f"seed {self.run.seed}, after {self.frame:,} frames"]
+        here = self.run.returns[self.run.evaluation["frame"] == self.frame]
+        if len(here):
+            parts.append(f"mean return of this evaluation: {here[0]:.0f}")
+        if np.isfinite(self.run.expert_return):
+            parts.append(f"expert: {self.run.expert_return:.0f}")
+        return "; ".join(parts)
 
-def collect(study: Study, per_group: int) -> tuple[list[Episode], list[str]]:
+
+def collect(groups: Sequence[Group], per_group: int) -> tuple[list[Episode], list[str]]:
     """Reads the newest videos of the first seed of each group that has any.
-
-    Args:
-      study: all runs.
-      per_group: how many, at least 0.
 
     Returns:
       The episodes, and one sentence for each that was left out.
     """
     episodes: list[Episode] = []
     left_out: list[str] = []
-    size = 0
-    for group in study.groups:
+    room = _MAX_BYTES
+    for group in groups if per_group else []:
         films = [(run, _films(run)) for run in group.runs]
         run, paths = next(((r, p) for r, p in films if p), (group.runs[0], []))
-        for path in paths[-per_group:] if per_group else []:
+        for path in paths[-per_group:]:
             try:
-                video = path.read_bytes()
+                video = _video(path, room)
             except OSError as error:
-                left_out.append(f"{path} can't be read ({error.strerror})")
+                left_out.append(f"{printable(path)} is left out: {error.strerror}")
                 continue
-            fault = _fault(video)
-            if size + len(video) > _MAX_BYTES:
-                fault = f"the page already holds {size / 1e6:.0f} MB of videos"
-            if fault is not None:
-                left_out.append(f"{path} is left out: {fault}")
+            except ValueError as error:
+                left_out.append(f"{printable(path)} is left out: {error}")
                 continue
-            size += len(video)
-            frame = _frame(path)
-            name = re.sub(r"\W+", "_", f"{group.task}_{group.label}").strip("_")
+            room -= len(video)
+            name = f"episode{len(episodes) + 1}_{group.task}_{group.variant.slug}"
             sheet = _sheet(
                 path.with_suffix(".npz"),
-                f"episode_{name}_seed{run.seed}_frame{frame}",
-                study.looks[group.label].colour,
+                re.sub(r"\W+", "_", name)[:100],
+                group.look.colour,
                 left_out,
             )
-            episodes.append(Episode(group, run, frame, video, sheet))
+            episodes.append(Episode(group, run, _frame(path), video, sheet))
     return episodes, left_out
 
 
-def return_at(run: Run, frame: int) -> float:
-    """Returns the mean return of the evaluation that was filmed; NaN if not known."""
-    there = np.flatnonzero(run.evaluation["frame"] == frame)
-    return float(run.returns[there[0]]) if len(there) else float("nan")
-
-
 def _films(run: Run) -> Sequence[pathlib.Path]:
-    paths = [p for p in (run.folder / "videos").glob("*.mp4") if _NAME.match(p.name)]
-    return sorted(paths, key=_frame)
+    found = (run.folder / "videos").glob("*.mp4")
+    return sorted((path for path in found if _NAME.fullmatch(path.name)), key=_frame)
 
 
 def _frame(path: pathlib.Path) -> int:
-    match = _NAME.match(path.name)
-    return int(match.group(1)) if match else 0
+    return int(path.stem.removeprefix("frame_"))
 
 
-def _fault(video: bytes) -> str | None:
-    """Says why this can't be a whole MP4 of sensible size; None if it can."""
+def _video(path: pathlib.Path, room: int) -> bytes:
+    """Returns a whole MP4.
+
+    Raises:
+      OSError: it cannot be read.
+      ValueError: says what else is wrong with it.
+    """
+    with archive.open_regular(path) as file:
+        video = file.read(_MAX_BYTES_EACH + 1)
     if len(video) > _MAX_BYTES_EACH:
-        return f"it has {len(video) / 1e6:.0f} MB"
+        raise ValueError(f"it has more than {_MAX_BYTES_EACH // 10**6} MB")
+    if len(video) > room:
+        raise ValueError(f"the page already holds {_MAX_BYTES // 10**6} MB of videos")
     if video[4:8] != b"ftyp" or b"moov" not in video or b"mdat" not in video:
-        return "it is no whole MP4"
-    return None
+        raise ValueError("it is not a whole MP4")
+    return video
 
 
 def _sheet(
     path: pathlib.Path, name: str, colour: str, left_out: list[str]
 ) -> Sheet | None:
-    """Draws what is stored beside a video; None if nothing is."""
+    """Plots what is stored beside a video; None if nothing is."""
+    if not path.exists():
+        return None
     try:
         names = _STORED & archive.member_names(path)
-        stored = archive.read_archive(path, max_bytes=dict.fromkeys(names, 2**26))
-        arrays = {name: np.asarray(each, np.float64) for name, each in stored.items()}
-        imitation = arrays.get("imitation_rewards", np.zeros(0))
-        task = arrays.get("task_rewards", np.zeros(0))
-        plan = arrays.get("plan", np.zeros((0, 0)))
-        if (imitation.ndim, task.ndim, plan.ndim) != (1, 1, 2):
-            raise ValueError("wrong number of axes")
-    except FileNotFoundError:
-        return None
+        limits = dict.fromkeys(names, _MAX_ARRAY_BYTES)
+        imitation, task, plan = _arrays(archive.read_archive(path, max_bytes=limits))
     except (OSError, ValueError, TypeError) as error:
-        left_out.append(f"{path} is left out: it can't be read ({error})")
+        left_out.append(f"{printable(path)} is left out: it {error}")
         return None
     panels = []
     if np.isfinite(imitation).any():
-        if not np.isfinite(task).any():
-            task = np.zeros(0)
         draw = functools.partial(
             plots.rewards, imitation=imitation, task=task, colour=colour
         )
         panels.append(Panel("rewards", draw, _REWARD_HEIGHT, plots.REWARD_MARGINS))
     if plan.size:
         draw = functools.partial(plots.plan, weights=plan)
-        # Below the rewards, at the same place: one step is one height.
+        # Below the rewards, with the same margins: agent steps are aligned.
         panels.append(Panel("transport plan", draw, _PLAN_HEIGHT, plots.REWARD_MARGINS))
     return Sheet(name, tuple(panels)) if panels else None
+
+
+def _arrays(
+    stored: dict[str, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the rewards and the plan of an archive, empty where there are none."""
+    kinds = {name: array.dtype.kind for name, array in stored.items()}
+    if not set(kinds.values()) <= set("fiub"):
+        raise ValueError("has arrays that are not of real numbers")
+    arrays = {name: array.astype(np.float64) for name, array in stored.items()}
+    for name, array in arrays.items():
+        if array.ndim != (2 if name == "plan" else 1):
+            raise ValueError(f"has an array {name} of {array.ndim} axes")
+        if max(array.shape, default=0) > _MAX_STEPS:
+            raise ValueError(f"has an array {name} of more than {_MAX_STEPS} steps")
+        if np.nanmax(np.abs(array), initial=0.0) > LARGEST:
+            raise ValueError(f"has an array {name} with numbers beyond any reward")
+    task = arrays.get("task_rewards", np.zeros(0))
+    return (
+        arrays.get("imitation_rewards", np.zeros(0)),
+        task if np.isfinite(task).any() else np.zeros(0),
+        arrays.get("plan", np.zeros((0, 0))),
+    )

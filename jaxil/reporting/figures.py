@@ -1,11 +1,15 @@
-"""The paper's figures: which runs each of them needs, and what a run is called.
+"""The paper's figures: which runs each of them compares, and what a run is called.
 
-The one place that knows the variants: `launch/sweep.py` makes the runs, and
-`jaxil.report` draws them.
+`launch/sweep.py` makes these runs and `jaxil.report` plots them.
 """
 
-from collections.abc import Callable, Mapping
+import functools
+import re
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal, NamedTuple
+
+from jaxil import methods
+from jaxil.methods import Method, Variation
 
 TASKS = (  # in the paper's order
     "cartpole_swingup",
@@ -17,37 +21,22 @@ TASKS = (  # in the paper's order
     "walker_walk",
     "walker_run",
 )
-METHOD_NAMES = {
-    "pdac": "P-DAC",
-    "psil": "P-SIL",
-    "dac": "DAC",
-    "sil": "SIL",
-    "bc": "BC",
-    "drqv2": "DrQ-v2",
-    "zero": "no reward",
-}
 # The paper's hard tasks have 5 million frames in its main results, fewer in ablations.
 ABLATION_FRAMES = 3_000_000
+NUM_SEEDS = 10
+_MISSING = "is not installed here"
 
-# What an ablation may change: the fields that tell runs of one method apart, with the
-# value of the method itself and what any other value is called.
-_CHANGES: dict[str, tuple[Any, Callable[[Any], str]]] = {
-    "demonstrations.num_episodes": (10, lambda n: f"{n} demonstration{'s'[: n != 1]}"),
-    "discriminator.sees_actions": (False, lambda _: "actions"),
-    "sinkhorn.cost": ("cosine", lambda cost: cost),
-    "sinkhorn.alignment": ("transport", lambda _: "not aligned"),
-    "shift_padding": (None, lambda _: "no augmentation"),
-}
-_ONE_METHOD = {"discriminator.sees_actions": "pdac", "sinkhorn.cost": "psil"}
-_ONE_METHOD["sinkhorn.alignment"] = "psil"
-_WITHOUT_DEMONSTRATIONS = ("drqv2", "zero")
+DEMONSTRATIONS = "demonstrations.num_episodes"
+_DEMONSTRATIONS_VARIATION = Variation(DEMONSTRATIONS, 10, "{} demonstrations")
+_AUGMENTATION_VARIATION = Variation("shift_padding", 4, "no augmentation")
+_MAX_SLUG = 200  # bytes; file systems take 255
 
 
 class Variant(NamedTuple):
     """A method with what an ablation changes about it.
 
     Attributes:
-      method: a key of `METHOD_NAMES`.
+      method: name of any method, known or not.
       overrides: config fields, dotted, with their values; empty for the method itself.
     """
 
@@ -56,19 +45,23 @@ class Variant(NamedTuple):
 
     @property
     def label(self) -> str:
-        """What figures and tables call it, such as "P-DAC, no augmentation"."""
-        words = [
-            name(self.overrides[field])
-            for field, (_, name) in _CHANGES.items()
-            if field in self.overrides
-        ]
-        return ", ".join([METHOD_NAMES[self.method], *words])
+        """Its name in figures and tables, such as "P-DAC, no augmentation"."""
+        return ", ".join([declaration(self.method).label, *self._words()])
 
     @property
     def slug(self) -> str:
-        """The same as the name of a folder, such as "pdac_no_augmentation"."""
-        words = self.label.split(", ")[1:]
-        return "_".join([self.method, *words]).replace(" ", "_")
+        """Its name as a folder, such as "pdac_no_augmentation"."""
+        text = "_".join([self.method, *self._words()])
+        slug = re.sub(r"[^\w.-]+", "_", text)
+        return slug.encode()[:_MAX_SLUG].decode(errors="ignore")
+
+    def _words(self) -> Iterator[str]:
+        for variation in _variations(self.method):
+            value = self.overrides.get(variation.field)
+            if variation.field not in self.overrides:
+                continue
+            is_single = variation.field == DEMONSTRATIONS and value == 1
+            yield "1 demonstration" if is_single else variation.words.format(value)
 
 
 class Figure(NamedTuple):
@@ -91,18 +84,15 @@ class Figure(NamedTuple):
     is_ablation: bool
 
 
-def _product(methods: str, *changes: Mapping[str, Any]) -> tuple[Variant, ...]:
+def _product(names: str, *changes: Mapping[str, Any]) -> tuple[Variant, ...]:
     return tuple(
-        Variant(m, change) for m in methods.split() for change in changes or [{}]
+        Variant(name, change) for name in names.split() for change in changes or [{}]
     )
 
 
 _NOT_ALIGNED = {"sinkhorn.alignment": "time"}
 _DEMONSTRATIONS = _product(
-    "pdac psil bc",
-    {"demonstrations.num_episodes": 1},
-    {},
-    {"demonstrations.num_episodes": 50},
+    "pdac psil bc", {DEMONSTRATIONS: 1}, {}, {DEMONSTRATIONS: 50}
 )
 _AUGMENTATION = _product("pdac psil bc", {}, {"shift_padding": 0})
 _DISTANCES = _product(
@@ -129,6 +119,20 @@ FIGURES = {
 }
 
 
+@functools.cache
+def declaration(name: str) -> Method:
+    """Returns a method's declaration; of one that is not installed, its name only."""
+    try:
+        return methods.get(name)
+    except (Exception, SystemExit):  # whatever importing somebody's file raises
+        return Method(name=name, label=name, about=_MISSING)
+
+
+def is_installed(method: str) -> bool:
+    """Returns whether a method's declaration can be read."""
+    return declaration(method).about != _MISSING
+
+
 def variant_of(config: Mapping[str, Any]) -> Variant:
     """Returns the variant that a run's config is.
 
@@ -136,25 +140,26 @@ def variant_of(config: Mapping[str, Any]) -> Variant:
       config: nested, as `config.json` holds it. Fields that it lacks, because an
         older jaxil wrote it, have their defaults.
     """
-    method = config["method"]
     overrides = {}
-    for field, (default, _) in _CHANGES.items():
-        value = _read(config, field, default)
-        if field == "shift_padding":
-            changed = value == 0
-        elif field == "demonstrations.num_episodes":
-            changed = value != default and method not in _WITHOUT_DEMONSTRATIONS
-        else:
-            changed = value != default and method == _ONE_METHOD[field]
+    for field, plain, _ in _variations(config["method"]):
+        value = _read(config, field, plain)
+        # Another padding than 0 is a setting, not an ablation.
+        changed = value == 0 if field == "shift_padding" else value != plain
         if changed:
             overrides[field] = value
-    return Variant(method, overrides)
+    return Variant(config["method"], overrides)
+
+
+def _variations(method: str) -> list[Variation]:
+    declared = declaration(method)
+    demonstrations = [_DEMONSTRATIONS_VARIATION] * declared.uses_demonstrations
+    return [*demonstrations, *declared.variations, _AUGMENTATION_VARIATION]
 
 
 def _read(config: Mapping[str, Any], field: str, default: Any) -> Any:
     value: Any = config
     for part in field.split("."):
-        if part not in value:
+        if not isinstance(value, Mapping) or part not in value:
             return default
         value = value[part]
-    return value
+    return tuple(value) if isinstance(value, list) else value

@@ -1,38 +1,47 @@
-"""Which runs are seeds of one thing, and what that thing is called."""
+"""Which runs are seeds of one thing, its name, and its look in every figure."""
 
+import colorsys
 import re
+import string
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib import colors
 
+from jaxil import config as jaxil_config
 from jaxil.reporting import figures
-from jaxil.reporting.runs import Run, paper_settings
+from jaxil.reporting.runs import Run, defaults_of
 
-# Runs that differ in nothing else are seeds of one thing. From the third on they decide
-# what is kept on disk, or how fast it comes, not what is learned.
-_FREE_FIELDS = (
-    "seed",
-    "total_frames",
-    "checkpoint_every_frames",
-    "video_every_evals",
-    "encoder.convolutions",
-    "replay_on_device",
-    "encoder.chunk_size",  # of older runs
-)
-# The name of the variant, or of the panel, says these already.
-_NAMED_FIELDS = (
-    "method",
-    "task",
-    "demonstrations.num_episodes",
-    "discriminator.sees_actions",
-    "sinkhorn.cost",
-    "sinkhorn.alignment",
-)
-# Settings of one method change nothing about another.
-_METHODS_OF = {"sinkhorn": ("psil", "sil"), "discriminator": ("pdac", "dac")}
 _SAME_EXPERT = 1e-3  # relative; the renderer's rounding is far below
+_MAX_SHOWN = 60  # characters of one value
+# Lines of one method: their dashes in line widths, marker, and lightness beside it.
+# Five and six have no common factor: thirty lines differ.
+_DASHES = ((), (4.0, 1.5), (1.0, 1.3), (5.0, 1.5, 1.0, 1.5), (7.0, 2.0), (2.5, 1.0))
+_MARKERS = ("o", "s", "^", "D", "v", "P")
+_LIGHTNESS = (0.0, 0.17, -0.07, 0.25, 0.09)
+_GREY = "#5b5b5b"
+_DARKEST, _BRIGHTEST = 0.27, 0.85  # visible on dark and on bright pages
+
+
+class Look(NamedTuple):
+    """How a group is plotted.
+
+    Attributes:
+      colour: as "#rrggbb".
+      dashes: lengths on and off, in line widths; empty for a solid line.
+      marker: of single points, in Matplotlib's letters.
+    """
+
+    colour: str
+    dashes: tuple[float, ...]
+    marker: str
+
+    @property
+    def line(self) -> Any:
+        """The dashes as Matplotlib's line style."""
+        return (0, self.dashes) if self.dashes else "-"
 
 
 class Group(NamedTuple):
@@ -41,20 +50,19 @@ class Group(NamedTuple):
     Attributes:
       task: such as "walker_walk".
       variant: the method with what an ablation changed.
-      settings: what tells it from other groups of the same variant and task, such as
-        "action_repeat 4"; empty if there is no other.
+      settings: those that differ from the paper's and from other groups of the same
+        variant and task, such as "action_repeat 4".
+      label: the variant with its settings, or with a letter for several of them.
+      look: the same for all groups of this label.
       runs: by seed and folder, at least one.
     """
 
     task: str
     variant: figures.Variant
-    settings: str
+    settings: tuple[str, ...]
+    label: str
+    look: Look
     runs: tuple[Run, ...]
-
-    @property
-    def label(self) -> str:
-        """What figures and tables call it."""
-        return label_of(self.variant, self.settings)
 
     @property
     def measured(self) -> tuple[Run, ...]:
@@ -67,26 +75,41 @@ class Group(NamedTuple):
         return sum(run.is_finished for run in self.runs)
 
 
-def label_of(variant: figures.Variant, settings: str) -> str:
-    """Returns the name of a variant with settings of its own."""
-    return f"{variant.label} ({settings})" if settings else variant.label
-
-
 def make_groups(runs: Iterable[Run]) -> list[Group]:
     """Sorts runs into groups, in the paper's order of tasks and methods."""
-    families: dict[tuple[str, str], list[Run]] = {}
+    families: dict[tuple[str, str, str], list[Run]] = {}
     for run in runs:
-        families.setdefault((run.task, run.variant.slug), []).append(run)
-    groups = []
-    for (task, _), family in families.items():
-        fields = differing_fields(family)
-        parts: dict[str, list[Run]] = {}
+        variant = run.variant
+        families.setdefault((run.task, variant.method, variant.label), []).append(run)
+    found: dict[tuple, list[Run]] = {}
+    for (task, method, label), family in families.items():
+        differing = differing_fields(family)
         for run in family:
-            parts.setdefault(settings_text(run.config, fields), []).append(run)
-        for settings, part in parts.items():
-            ordered = tuple(sorted(part, key=lambda run: (run.seed, run.name)))
-            groups.append(Group(task, ordered[0].variant, settings, ordered))
-    return sorted(groups, key=lambda g: (task_order(g.task), label_order(g)))
+            settings = tuple(
+                f"{field} {short(value)}"
+                for field, value in changes(run).items()
+                if field in differing
+            )
+            found.setdefault((task, method, label, settings), []).append(run)
+    ordered = sorted(
+        found.items(),
+        key=lambda item: (
+            task_order(item[0][0]),
+            figures.declaration(item[0][1]).rank,
+            item[0][1],
+            len(item[1][0].variant.overrides),
+            [_by_number(text) for text in (item[0][2], *item[0][3])],
+        ),
+    )
+    labels = _labels(key[1:] for key, _ in ordered)
+    looks = _looks((figures.declaration(key[0]).colour, k) for key, k in labels.items())
+    groups = []
+    for (task, *key), members in ordered:
+        label = labels[tuple(key)]
+        in_order = tuple(sorted(members, key=lambda run: (run.seed, run.name)))
+        variant = in_order[0].variant
+        groups.append(Group(task, variant, key[2], label, looks[label], in_order))
+    return groups
 
 
 def differing_fields(runs: Sequence[Run]) -> list[str]:
@@ -101,8 +124,8 @@ def differing_fields(runs: Sequence[Run]) -> list[str]:
 
 
 def changes(run: Run) -> dict[str, Any]:
-    """Returns the settings that are not the paper's, by dotted name."""
-    paper = paper_settings(run)
+    """Returns the settings that differ from the paper's, by dotted name."""
+    paper = defaults_of(run.variant.method, run.task)
     return {
         field: value
         for field, value in sorted(run.config.items())
@@ -110,27 +133,25 @@ def changes(run: Run) -> dict[str, Any]:
     }
 
 
-def settings_text(config: Mapping[str, Any], fields: Iterable[str]) -> str:
-    """Returns fields with their values for people, such as "batch_size 64"."""
-    return ", ".join(f"{field} {_short(config.get(field))}" for field in fields)
+def short(value: Any) -> str:
+    """Returns a setting's value for people, such as "5M" or "(1, 2)"."""
+    if isinstance(value, int) and not isinstance(value, bool):
+        if value and value % 1000 == 0:
+            return f"{value // 1000}k" if value % 1_000_000 else f"{value // 10**6}M"
+        return str(value)
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, list):
+        return "(" + ", ".join(map(short, value))[:_MAX_SHOWN] + ")"
+    if isinstance(value, str) and value and value.isprintable():
+        return value[:_MAX_SHOWN]
+    return ascii(value)[:_MAX_SHOWN]
 
 
 def task_order(task: str) -> tuple[int, str]:
     """Sorts tasks: the paper's, in its order, then others by name."""
     tasks = figures.TASKS
     return (tasks.index(task) if task in tasks else len(tasks), task)
-
-
-def label_order(group: Group) -> tuple:
-    """Sorts groups of a task: by method, plain ones first."""
-    variant = group.variant
-    methods = list(figures.METHOD_NAMES)
-    return (
-        methods.index(variant.method),
-        len(variant.overrides),
-        _by_number(variant.label),
-        _by_number(group.settings),
-    )
 
 
 def expert_returns(groups: Iterable[Group]) -> list[tuple[float, list[str]]]:
@@ -154,16 +175,6 @@ def expert_returns(groups: Iterable[Group]) -> list[tuple[float, list[str]]]:
     return experts
 
 
-def duplicate_seeds(group: Group) -> dict[int, list[str]]:
-    """Returns the seeds that more than one run has, with these runs' names."""
-    counts = Counter(run.seed for run in group.runs)
-    return {
-        seed: [run.name for run in group.runs if run.seed == seed]
-        for seed, count in counts.items()
-        if count > 1
-    }
-
-
 def tasks_of(groups: Iterable[Group]) -> dict[str, list[Group]]:
     """Returns the groups of each task, in the order in which they come."""
     tasks: dict[str, list[Group]] = {}
@@ -173,21 +184,49 @@ def tasks_of(groups: Iterable[Group]) -> dict[str, list[Group]]:
 
 
 def _matters(run: Run, field: str) -> bool:
-    group = field.split(".")[0]
-    is_own = run.variant.method in _METHODS_OF.get(group, (run.variant.method,))
-    return is_own and field not in (*_FREE_FIELDS, *_NAMED_FIELDS)
+    variations = figures.declaration(run.variant.method).variations
+    # The label, or the panel, says these already.
+    named = ("method", "task", figures.DEMONSTRATIONS, *(v.field for v in variations))
+    return field not in (*jaxil_config.FREE_FIELDS, "seed", *named)
 
 
-def _short(value: Any) -> str:
-    if isinstance(value, int) and not isinstance(value, bool):
-        if value and value % 1000 == 0:
-            return f"{value // 1000}k" if value % 1_000_000 else f"{value // 10**6}M"
-        return str(value)
-    if isinstance(value, float):
-        return f"{value:g}"
-    if isinstance(value, list):
-        return "(" + ", ".join(map(_short, value)) + ")"
-    return "''" if value == "" else str(value)
+def _labels(keys: Iterable[tuple[str, str, tuple[str, ...]]]) -> dict[tuple, str]:
+    """Names each (method, label, settings): a letter stands for several settings."""
+    found: dict[tuple, str] = {}
+    letters: Counter[tuple[str, str]] = Counter()
+    for key in keys:
+        method, label, settings = key
+        if key in found:
+            continue
+        if len(settings) > 1:
+            cycle, index = divmod(letters[method, label], len(string.ascii_uppercase))
+            letters[method, label] += 1
+            found[key] = f"{label} ({string.ascii_uppercase[index]}{cycle or ''})"
+        else:
+            found[key] = f"{label} ({settings[0]})" if settings else label
+    return found
+
+
+def _looks(coloured: Iterable[tuple[str, str]]) -> dict[str, Look]:
+    """Returns the look of each label, from pairs of its method's colour and it."""
+    looks: dict[str, Look] = {}
+    counts: Counter[str] = Counter()
+    for colour, label in coloured:
+        index = counts[colour]
+        counts[colour] += 1
+        looks[label] = Look(
+            _shade(colour, _LIGHTNESS[index % len(_LIGHTNESS)]),
+            _DASHES[index % len(_DASHES)],
+            _MARKERS[index % len(_MARKERS)],
+        )
+    return looks
+
+
+def _shade(colour: str, change: float) -> str:
+    rgb = colors.to_rgb(colour if colors.is_color_like(colour) else _GREY)
+    hue, lightness, saturation = colorsys.rgb_to_hls(*rgb)
+    lightness = min(max(lightness + change, _DARKEST), _BRIGHTEST)
+    return colors.to_hex(colorsys.hls_to_rgb(hue, lightness, saturation))
 
 
 def _by_number(text: str) -> list[tuple[int, float, str]]:

@@ -10,8 +10,7 @@ from jaxil.reporting.runs import Run, Table
 from jaxil.reporting.statistics import Estimate
 
 LEVELS = (0.5, 0.8, 0.9)  # of the expert's return
-# More than a figure's width can show.
-_MAX_POINTS = 400
+_MAX_POINTS = 400  # of a curve; a figure's width shows no more
 
 
 class Curve(NamedTuple):
@@ -39,29 +38,13 @@ class Final(NamedTuple):
       group: whose.
       returns: of each measured run, in their order. Shape [S], S >= 1.
       mean: with Student's interval.
-      middle: the interquartile mean, with its bootstrap interval.
-      expert: the demonstrations' mean return; NaN if unknown.
+      expert: the mean return of the runs' own demonstrations; NaN without any.
     """
 
     group: Group
     returns: np.ndarray
     mean: Estimate
-    middle: Estimate
     expert: float
-
-
-class Arrival(NamedTuple):
-    """When one run was first as good as a share of its expert.
-
-    Attributes:
-      run: which.
-      frames: at the first evaluation at or above each of LEVELS; NaN for never.
-      hours: the same in hours.
-    """
-
-    run: Run
-    frames: tuple[float, ...]
-    hours: tuple[float, ...]
 
 
 def curve(group: Group, x: str, y: str, *, table: str = "evaluation") -> Curve | None:
@@ -81,13 +64,8 @@ def curve(group: Group, x: str, y: str, *, table: str = "evaluation") -> Curve |
     if len(joined) > _MAX_POINTS:
         shown = np.linspace(0, len(joined) - 1, _MAX_POINTS).round().astype(int)
         joined, values = joined[shown], values[:, shown]
-    return Curve(
-        group=group,
-        x=joined,
-        mean=statistics.mean_interval(values),
-        count=(~np.isnan(values)).sum(axis=0),
-        num_runs=len(found),
-    )
+    count = (~np.isnan(values)).sum(axis=0)
+    return Curve(group, joined, statistics.mean_interval(values), count, len(found))
 
 
 def series(table: Table, x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
@@ -95,48 +73,27 @@ def series(table: Table, x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
     column = "seconds" if x == "hours" else x
     if column not in table or y not in table:
         return np.zeros(0), np.zeros(0)
-    places, values = table[column], table[y]
-    good = np.isfinite(places) & np.isfinite(values)
-    places, first = np.unique(places[good], return_index=True)
-    return places / 3600.0 if x == "hours" else places, values[good][first]
+    good = np.isfinite(table[column]) & np.isfinite(table[y])
+    position, first = np.unique(table[column][good], return_index=True)
+    return position / 3600.0 if x == "hours" else position, table[y][good][first]
 
 
-def final(group: Group, expert: float) -> Final | None:
-    """Returns the last evaluations; None before the first one.
-
-    Args:
-      group: the seeds.
-      expert: the return of the expert of runs that have none of their own.
-    """
+def final(group: Group) -> Final | None:
+    """Returns the last evaluations; None before the first one."""
     if not group.measured:
         return None
     returns = np.array([run.returns[-1] for run in group.measured])
-    experts = [expert_of(run, expert) for run in group.measured]
-    return Final(
-        group=group,
-        returns=returns,
-        mean=statistics.mean_interval(returns),
-        middle=statistics.stratified_interval([returns]),
-        expert=float(np.mean(experts)),
-    )
+    expert = float(np.mean([run.expert_return for run in group.measured]))
+    return Final(group, returns, statistics.mean_interval(returns), expert)
 
 
-def arrival(run: Run, expert: float) -> Arrival:
-    """Says when a run reached each of LEVELS.
+def arrivals(run: Run, x: str) -> list[float]:
+    """Returns when a run reached each of LEVELS of its expert; NaN for never.
 
     Args:
-      run: any.
-      expert: the return of the expert, if the run has none of its own.
+      run: any; one without an expert of its own reaches none.
+      x: "frame" or "hours".
     """
-    levels = [share * expert_of(run, expert) for share in LEVELS]
-
-    def reached(x: str) -> tuple[float, ...]:
-        places, returns = series(run.evaluation, x, "task_return_mean")
-        return tuple(statistics.first_reaching(places, returns, at) for at in levels)
-
-    return Arrival(run, reached("frame"), reached("hours"))
-
-
-def expert_of(run: Run, other: float) -> float:
-    """Returns the return of a run's expert, `other` if it imitates none."""
-    return run.expert_return if np.isfinite(run.expert_return) else other
+    position, returns = series(run.evaluation, x, "task_return_mean")
+    levels = [share * run.expert_return for share in LEVELS]
+    return [statistics.first_reaching(position, returns, level) for level in levels]

@@ -1,84 +1,93 @@
-"""The paper's figures: what is there, what is missing, and what makes it."""
+"""The paper's figures: what there is, what is missing, and the command for it."""
 
 from typing import NamedTuple
 
-from jaxil.reporting import figures, results
+from jaxil.reporting import charts, figures, measures
+from jaxil.reporting.figures import Figure
 from jaxil.reporting.groups import Group
-from jaxil.reporting.results import Study
 from jaxil.reporting.sheets import Sheet
 
 
 class PaperFigure(NamedTuple):
-    """One figure of the paper, as far as runs are there.
+    """One figure of the paper, as far as there are runs for it.
 
     Attributes:
       figure: which.
-      sheet: what can be drawn; None without runs.
-      counts: finished seeds, at most as many as wanted, by (task, variant's label).
-      started: seeds that are there but not finished, by the same.
-      command: makes what is missing; empty if nothing is.
+      sheet: the plots; None where no runs show what it is about.
+      cells: rows of a table: each task, then "finished of wanted" for each variant.
+      num_finished: finished seeds of all tasks and variants, none beyond those wanted.
+      num_wanted: how many there should be.
+      command: trains what is missing; empty if nothing is.
     """
 
-    figure: figures.Figure
+    figure: Figure
     sheet: Sheet | None
-    counts: dict[tuple[str, str], int]
-    started: dict[tuple[str, str], int]
+    cells: list[list[str]]
+    num_finished: int
+    num_wanted: int
     command: str
 
 
-def paper_figures(study: Study, num_seeds: int) -> list[PaperFigure]:
+def paper_figures(groups: list[Group], num_seeds: int) -> list[PaperFigure]:
     """Returns all figures of the paper's experiments.
 
     Args:
-      study: all runs; those with other settings than the paper's are drawn, too.
+      groups: of all runs; those with other settings than the paper's are plotted, too.
       num_seeds: how many each line should have, at least 1.
     """
-    return [_figure(study, figure, num_seeds) for figure in figures.FIGURES.values()]
+    return [_figure(groups, each, num_seeds) for each in figures.FIGURES.values()]
 
 
-def _figure(study: Study, figure: figures.Figure, num_seeds: int) -> PaperFigure:
-    slugs = [variant.slug for variant in figure.variants]
-    groups = [
+def _figure(groups: list[Group], figure: Figure, num_seeds: int) -> PaperFigure:
+    own = [
         group
-        for group in study.groups
-        if group.task in figures.TASKS and group.variant.slug in slugs
+        for group in groups
+        if group.task in figures.TASKS and group.variant in figure.variants
     ]
-    counts: dict[tuple[str, str], int] = {}
-    started: dict[tuple[str, str], int] = {}
+    cells, missing, num_finished = [], [], 0
     for task in figures.TASKS:
+        row = [task]
         for variant in figure.variants:
-            own = [
+            runs = [
                 run
-                for group in groups
-                if group.task == task and group.variant.slug == variant.slug
+                for group in own
+                if (group.task, group.variant) == (task, variant)
                 for run in group.runs
             ]
-            finished = {run.seed for run in own if run.is_finished}
-            key = (task, variant.label)
-            counts[key] = min(len(finished), num_seeds)
-            started[key] = len({run.seed for run in own} - finished)
-    tasks = [
-        task
-        for task in figures.TASKS
-        if any(counts[task, v.label] < num_seeds for v in figure.variants)
-    ]
+            finished = {run.seed for run in runs if run.is_finished}
+            begun = {run.seed for run in runs} - finished
+            count = min(len(finished), num_seeds)
+            num_finished += count
+            row.append(
+                f"{count}/{num_seeds}" + (f" + {len(begun)} begun" if begun else "")
+            )
+            if count < num_seeds and task not in missing:
+                missing.append(task)
+        cells.append(row)
     command = (
         f"python launch/sweep.py --ablation=figure{figure.number} "
-        f"--tasks={','.join(tasks)} --seeds={num_seeds} --workdir=DIR"
+        f"--tasks={','.join(missing)} --seeds={num_seeds} --workdir=DIR"
     )
+    # An ablation of which only the plain method has run shows nothing.
+    shows = not figure.is_ablation or any(group.variant.overrides for group in own)
     return PaperFigure(
-        figure, _draw(study, figure, groups), counts, started, command if tasks else ""
+        figure,
+        _sheet(figure, own) if shows else None,
+        cells,
+        num_finished,
+        len(figure.variants) * len(figures.TASKS) * num_seeds,
+        command if missing else "",
     )
 
 
-def _draw(study: Study, figure: figures.Figure, groups: list[Group]) -> Sheet | None:
+def _sheet(figure: Figure, groups: list[Group]) -> Sheet | None:
     name = f"figure{figure.number:02d}"
     if figure.kind == "bars":
-        return results.bar_sheet(study, results.finals(study, groups), name=name)
+        finals = [f for f in map(measures.final, groups) if f is not None]
+        return charts.bar_sheet(finals, name=name)
     over, column = {
         "frames": ("frame", "task_return_mean"),
         "hours": ("hours", "task_return_mean"),
         "wasserstein": ("frame", "wasserstein_to_expert"),
     }[figure.kind]
-    sheet, _ = results.curve_sheet(study, groups, name=name, over=over, column=column)
-    return sheet
+    return charts.curve_sheet(groups, name=name, over=over, column=column)[0]

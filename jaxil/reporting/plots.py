@@ -1,17 +1,16 @@
-"""Draws one panel: curves, bars, logits, an episode's rewards, a transport plan."""
+"""Plots one panel: curves, bars, logits, an episode's rewards, a transport plan."""
 
-import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from jaxil.reporting.appearance import INK, Look
 from jaxil.reporting.measures import Curve, Final
 
+# Stands for the page's text colour, which is light on dark pages.
+INK = "#1b1c1e"
 _DOTTED = 40  # points; a line with fewer shows each of them
-_LABEL_WIDTH = 58  # characters above a bar
-_BAR_LINES = 1.8  # of text, that a bar takes
+_BAR_LINES = 2.8  # of text, that a bar takes with its label
 _LINE_HEIGHT = 0.145  # inches
 # Left and right of the axes, in inches.
 BAR_MARGINS, REWARD_MARGINS = (0.1, 0.2), (0.72, 0.62)
@@ -22,24 +21,22 @@ _BAND_ROOM = 1.25
 def curves(
     axes: Any,
     lines: Sequence[Curve],
-    looks: Mapping[str, Look],
     *,
     levels: Sequence[tuple[float, str]] = (),
     over: str,
     name: str,
 ) -> None:
-    """Draws the mean of each group with its interval.
+    """Plots the mean of each group with its interval.
 
     Args:
       axes: Matplotlib's.
       lines: at least one.
-      looks: by label.
       levels: heights to mark with a dashed line, and their names.
       over: "frame" or "hours".
-      name: what is drawn, for the vertical axis.
+      name: of the vertical axis.
     """
     for line in lines:
-        _line(axes, line, looks[line.group.label])
+        _line(axes, line)
     for value, text in levels:
         axes.axhline(value, color=INK, ls=(0, (4, 3)), lw=0.9, alpha=0.75, zorder=1)
         axes.annotate(
@@ -61,91 +58,70 @@ def curves(
     axes.grid(axis="y", alpha=0.16, lw=0.6, color=INK)
 
 
-def bars(
-    axes: Any, finals: Sequence[Final], looks: Mapping[str, Look], *, extent: float
-) -> None:
-    """Draws the mean of the last evaluations, a dot for each seed.
+def bars(axes: Any, finals: Sequence[Final]) -> None:
+    """Plots the mean of the last evaluations, a dot for each seed.
 
     Hatched where a run is unfinished.
 
     Args:
       axes: Matplotlib's.
       finals: at least one.
-      looks: by label.
-      extent: height of the axis in text lines, at least `bars_extent`, so that bars
-        of several panels are equally thick.
     """
-    place, highest = 0.0, 1.0
-    for final in finals:
-        look = looks[final.group.label]
-        lines = _label_lines(final)
-        place += len(lines)
-        axes.text(0, place, "\n".join(lines), fontsize=8, va="bottom", linespacing=1.15)
-        place += _BAR_LINES / 2
+    experts = sorted({round(f.expert, 1) for f in finals if np.isfinite(f.expert)})
+    highest = max([1.0, *experts, *(float(f.returns.max()) for f in finals)])
+    bounds = [float(f.mean.high) for f in finals if np.isfinite(f.mean.high)]
+    # The interval of two seeds can be many times as long as their bar.
+    highest = max([highest, *(min(bound, _BAND_ROOM * highest) for bound in bounds)])
+    for row, final in enumerate(finals):
+        colour = final.group.look.colour
+        y = _BAR_LINES * (row + 0.68)
+        text_y = _BAR_LINES * (row + 0.36)
+        axes.text(0, text_y, final.group.label, fontsize=8, va="bottom")
         unfinished = final.group.num_finished < len(final.group.runs)
         mean, low, high = map(float, final.mean)
         axes.barh(
-            place,
+            y,
             mean,
             height=1.1,
-            color=look.colour,
+            color=colour,
             alpha=0.88,
             lw=0,
             hatch="////" if unfinished else None,
             edgecolor="#ffffff88",
         )
         if np.isfinite(high):
-            axes.plot([low, high], [place, place], color=INK, lw=1.3, zorder=4)
-        axes.plot(
-            final.returns,
-            np.full(len(final.returns), place),
-            ls="",
-            marker="o",
-            ms=3.6,
-            mfc=look.colour,
-            mec=INK,
-            mew=0.8,
-            zorder=5,
-        )
-        top = np.nanmax([mean, high, final.returns.max()])
-        highest = max(highest, float(top))
+            axes.plot([low, high], [y, y], color=INK, lw=1.3, zorder=4)
+        dots = {"ls": "", "marker": "o", "ms": 3.6, "mew": 0.8, "zorder": 5}
+        heights = np.full(len(final.returns), y)
+        axes.plot(final.returns, heights, mfc=colour, mec=INK, **dots)
+        top = float(np.nanmax([mean, high, final.returns.max()]))
         axes.annotate(
             f"{mean:.0f}",
-            (max(float(top), 0.0), place),
+            (min(max(top, 0.0), highest), y),
             xytext=(6, 0),
             textcoords="offset points",
             va="center",
             fontsize=8.5,
         )
-        place += _BAR_LINES / 2
-    experts = sorted({round(f.expert, 1) for f in finals if np.isfinite(f.expert)})
     for expert in experts:
         axes.axvline(expert, color=INK, ls=(0, (4, 3)), lw=0.9, alpha=0.75, zorder=1)
-    right = 1.12 * max([highest, *experts])
     lowest = min(0.0, *(float(f.returns.min()) for f in finals))
-    axes.set_xlim(lowest, right)
-    axes.set_ylim(extent, 0)
+    axes.set_xlim(lowest, 1.12 * highest)
+    axes.set_ylim(_BAR_LINES * len(finals), 0)
     axes.set_yticks([])
     axes.spines["left"].set_visible(False)
     axes.set_xlabel("task return" + (", expert dashed" if experts else ""))
 
 
-def bars_extent(finals: Sequence[Final]) -> float:
-    """Returns the height that `bars` needs, in text lines."""
-    return sum(len(_label_lines(final)) + _BAR_LINES for final in finals)
-
-
-def bars_height(extent: float) -> float:
+def bars_height(rows: int) -> float:
     """Returns the height of a panel of bars, in inches."""
-    return 0.6 + _LINE_HEIGHT * extent
+    return 0.6 + _LINE_HEIGHT * _BAR_LINES * rows
 
 
-def logits(
-    axes: Any, pairs: Sequence[tuple[Curve, Curve]], looks: Mapping[str, Look]
-) -> None:
-    """Draws the discriminator's logits of expert (solid) and agent (dotted)."""
+def logits(axes: Any, pairs: Sequence[tuple[Curve, Curve]]) -> None:
+    """Plots the discriminator's logits of expert (solid) and agent (dotted)."""
     for expert, agent in pairs:
-        colour = looks[expert.group.label].colour
+        colour = expert.group.look.colour
         axes.plot(expert.x, expert.mean.value, color=colour, lw=1.4)
         axes.plot(agent.x, agent.mean.value, color=colour, lw=1.4, ls=(0, (1, 1.2)))
     axes.axhline(0.0, color=INK, lw=0.7, alpha=0.5)
@@ -155,7 +131,7 @@ def logits(
 
 
 def rewards(axes: Any, imitation: np.ndarray, task: np.ndarray, colour: str) -> None:
-    """Draws the rewards of one episode.
+    """Plots the rewards of one episode.
 
     Args:
       axes: Matplotlib's.
@@ -176,7 +152,7 @@ def rewards(axes: Any, imitation: np.ndarray, task: np.ndarray, colour: str) -> 
 
 
 def plan(axes: Any, weights: np.ndarray) -> None:
-    """Draws a transport plan: which expert frame each agent frame is matched with.
+    """Plots a transport plan: which expert frame each agent frame is matched with.
 
     Args:
       axes: Matplotlib's.
@@ -199,13 +175,8 @@ def plan(axes: Any, weights: np.ndarray) -> None:
     axes.set_ylabel("expert step")
 
 
-def _label_lines(final: Final) -> list[str]:
-    # Only after commas: a setting stays beside its value.
-    text = final.group.label.replace(" ", "\xa0").replace(",\xa0", ", ")
-    return textwrap.wrap(text, _LABEL_WIDTH)
-
-
-def _line(axes: Any, line: Curve, look: Look) -> None:
+def _line(axes: Any, line: Curve) -> None:
+    look = line.group.look
     marker = look.marker if len(line.x) <= _DOTTED else None
     mean, low, high = line.mean
     whole = line.count == line.num_runs

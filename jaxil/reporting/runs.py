@@ -1,4 +1,4 @@
-"""Finding runs and reading what they wrote, however little that is."""
+"""Finding runs and reading what they wrote, however little or damaged that is."""
 
 import functools
 import json
@@ -10,22 +10,27 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxil import config as jaxil_config
-from jaxil.files import tables
+from jaxil import methods
+from jaxil.files import archive, tables
 from jaxil.files.settings import as_stored, flat
 from jaxil.reporting import figures
 
-# Large folders of a run in which no other run can be.
+# Large folders of a run, in which there are no other runs.
 _OWN_FOLDERS = ("checkpoints", "replay", "tensorboard", "videos")
 _RETURN = "task_return_mean"
 _FAILED = "failed.json"  # of launch/sweep.py
-# What a run of this jaxil writes; anything else is a damaged file.
+# What every run writes; without it a file is damaged.
 _NEEDED = {"method": str, "task": str, "seed": int, "total_frames": int}
+# Beyond any true setting, return or time; sums of larger ones would overflow.
+LARGEST = 1e15
+_MAX_REASON = 200  # characters of a file's fault that are shown
+_MAX_CONFIG_BYTES = 10**7
 
 Table = Mapping[str, np.ndarray]
 
 
 class UnreadableError(Exception):
-    """A config.json that is not that of a run; the message says why."""
+    """A config.json that does not belong to a run; the message says why."""
 
 
 class Run(NamedTuple):
@@ -33,8 +38,8 @@ class Run(NamedTuple):
 
     Attributes:
       folder: where it is.
-      name: the folder as people call it.
-      config: every setting by its dotted name; what the file lacks has its default.
+      name: the folder as text.
+      config: its method's settings by dotted name, with defaults for missing ones.
       variant: its method with what an ablation changed.
       evaluation: eval.csv by column, rising frames, finite returns. Shapes [E].
       training: train.csv by column, rising frames. Shapes [R].
@@ -60,11 +65,6 @@ class Run(NamedTuple):
     def seed(self) -> int:
         """The seed."""
         return self.config["seed"]
-
-    @property
-    def total_frames(self) -> int:
-        """Environment frames that it was asked for."""
-        return self.config["total_frames"]
 
     @property
     def returns(self) -> np.ndarray:
@@ -96,9 +96,8 @@ class Run(NamedTuple):
     @property
     def is_finished(self) -> bool:
         """Whether its last evaluation came after all frames."""
-        return bool(len(self.returns)) and bool(
-            self.evaluation["frame"][-1] >= self.total_frames
-        )
+        frames = self.evaluation["frame"]
+        return bool(len(frames)) and bool(frames[-1] >= self.config["total_frames"])
 
     @property
     def state(self) -> str:
@@ -107,11 +106,12 @@ class Run(NamedTuple):
             return "finished"
         if self.frames == 0:
             return "empty"
-        return f"unfinished: frame {self.frames:,.0f} of {self.total_frames:,}"
+        total_frames = self.config["total_frames"]
+        return f"unfinished: frame {self.frames:,.0f} of {total_frames:,}"
 
     def _last(self, column: str) -> float:
-        tables = (self.evaluation, self.training)
-        last = [t[column][-1] for t in tables if column in t and len(t[column])]
+        both = (self.evaluation, self.training)
+        last = [t[column][-1] for t in both if column in t and len(t[column])]
         return float(np.max(last, initial=-np.inf, where=np.isfinite(last)))
 
 
@@ -120,9 +120,6 @@ def find(roots: Iterable[pathlib.Path]) -> list[pathlib.Path]:
 
     That is a folder with a config.json, or with the failed.json that a sweep writes for
     a run that ended before it had one.
-
-    Args:
-      roots: folders that exist.
     """
     found: dict[pathlib.Path, pathlib.Path] = {}
     for root in roots:
@@ -135,86 +132,108 @@ def find(roots: Iterable[pathlib.Path]) -> list[pathlib.Path]:
 
 
 def read(folder: pathlib.Path) -> Run:
-    """Reads one run, which may be going on.
+    """Reads one run, which may still be training.
 
     Raises:
-      UnreadableError: its config.json is none.
+      UnreadableError: its config.json is damaged or missing.
     """
     stored = _read_config(folder / "config.json")
-    nested, device = stored["config"], str(stored.get("device", "unknown"))
+    nested = stored["config"]
+    defaults = defaults_of(nested["method"], nested["task"])
+    config = {name: _setting(nested, name, value) for name, value in defaults.items()}
     remarks: list[str] = []
+    if not figures.is_installed(nested["method"]):
+        remarks.append(f"its method {nested['method']!r} is not installed here")
+        known = {name.split(".")[0] for name in config}
+        own = {key: value for key, value in nested.items() if key not in known}
+        config |= flat(own)
     if (folder / _FAILED).exists():
-        remarks.append(f"failed, {_exit_status(folder)}; its log says why")
+        remarks.append(f"failed, {_exit_status(folder)}; see its log")
     evaluation = _read_table(folder / "eval.csv", _RETURN, remarks)
     if not len(evaluation[_RETURN]) and not any("eval.csv" in r for r in remarks):
         remarks.append("no evaluation yet")
     training = _read_table(folder / "train.csv", None, remarks)
     return Run(
         folder=folder,
-        name=folder.as_posix(),
-        config={**_defaults(nested["method"], nested["task"]), **flat(nested)},
+        name=printable(folder),
+        config=config,
         variant=figures.variant_of(nested),
         evaluation=evaluation,
         training=training,
-        device=device,
+        device=str(stored.get("device", "unknown"))[:_MAX_REASON],
         remarks=tuple(remarks),
     )
 
 
-def paper_settings(run: Run) -> dict[str, Any]:
-    """Returns the paper's settings for a run's method and task, by dotted names."""
-    return _defaults(run.config["method"], run.task)
-
-
 @functools.cache
-def _defaults(method: str, task: str) -> dict[str, Any]:
-    return flat(as_stored(jaxil_config.default_config(method, task).to_dict()))
+def defaults_of(method: str, task: str) -> dict[str, Any]:
+    """Returns the paper's settings for a method and task, by dotted name.
+
+    Of a method that is not installed only the settings that all methods have.
+    """
+    stand_in = method if figures.is_installed(method) else next(iter(methods.known()))
+    names = jaxil_config.fields(stand_in)
+    if stand_in != method:
+        names = jaxil_config.FIELDS
+    config = jaxil_config.default_config(stand_in, task)
+    values = {name: jaxil_config.read(config, name) for name in names}
+    return as_stored({**values, "method": method})
+
+
+def printable(path: pathlib.Path) -> str:
+    """Returns a path as text that any file can hold."""
+    return path.as_posix().encode(errors="replace").decode()
 
 
 def _read_config(path: pathlib.Path) -> dict[str, Any]:
     try:
-        stored = json.loads(path.read_text())
+        with archive.open_regular(path) as file:
+            stored = json.loads(file.read(_MAX_CONFIG_BYTES))
+        # Lone surrogates, which no file can hold, and nesting too deep to walk.
+        json.dumps(stored, ensure_ascii=False).encode()
     except OSError as error:
         failed = (path.parent / _FAILED).exists()
         why = f"the run failed, {_exit_status(path.parent)}" if failed else ""
-        why = why or str(error.strerror)
-        raise UnreadableError(f"can't be read ({why})") from error
+        raise UnreadableError(f"cannot be read ({why or error.strerror})") from error
     except (ValueError, RecursionError) as error:
-        raise UnreadableError(f"is damaged ({error})") from error
+        raise UnreadableError(f"is damaged ({str(error)[:_MAX_REASON]})") from error
     config = stored.get("config") if isinstance(stored, dict) else None
     if not isinstance(config, dict):
         raise UnreadableError('has no "config" with settings in it')
     for field, kind in _NEEDED.items():
         value = config.get(field)
+        is_text = isinstance(value, str)
         if not isinstance(value, kind) or isinstance(value, bool):
-            raise UnreadableError(f"has no {field} ({value!r})")
-    if config["method"] not in figures.METHOD_NAMES:
-        known = ", ".join(figures.METHOD_NAMES)
-        raise UnreadableError(f"method={config['method']!r} is none of {known}")
-    for field, value in _defaults(config["method"], config["task"]).items():
-        _check_kind(config, field, value)
+            raise UnreadableError(f"has no {field} ({_shown(value)})")
+        if is_text and not (value.isprintable() and 0 < len(value) <= _MAX_REASON):
+            raise UnreadableError(f"has a damaged {field} ({_shown(value)})")
     return stored
 
 
 def _exit_status(folder: pathlib.Path) -> str:
     try:
-        status = json.loads((folder / _FAILED).read_text())["exit_status"]
-    except (OSError, ValueError, KeyError, TypeError):
-        status = "unknown"
+        with archive.open_regular(folder / _FAILED) as file:
+            status = int(json.loads(file.read(_MAX_CONFIG_BYTES))["exit_status"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return "exit status unknown"
     return f"exit status {status}"
 
 
-def _check_kind(config: Mapping[str, Any], field: str, default: Any) -> None:
-    """Refuses text where a number belongs, a number where a group does, and so on."""
-    value: Any = config
+def _setting(nested: Mapping[str, Any], field: str, default: Any) -> Any:
+    """Returns one setting; refuses text where a number belongs, and so on."""
+    value: Any = nested
     for part in field.split("."):
         if not isinstance(value, Mapping):
             raise UnreadableError(f"{field} must lie in a group of settings")
         if part not in value:
-            return  # an older jaxil wrote the file
+            return default  # an older jaxil wrote the file
         value = value[part]
     if _kind(value) != _kind(default):
-        raise UnreadableError(f"{field}={value!r} must be of the kind of {default!r}")
+        rule = f"must be of the kind of {default!r}"
+        raise UnreadableError(f"{field}={_shown(value)} {rule}")
+    if _kind(value) is float and not abs(value) <= LARGEST:
+        raise UnreadableError(f"{field}={_shown(value)} is beyond any true value")
+    return value
 
 
 def _kind(value: Any) -> type:
@@ -222,13 +241,18 @@ def _kind(value: Any) -> type:
     return float if is_number else type(value)
 
 
+def _shown(value: Any) -> str:
+    return ascii(value)[:_MAX_REASON]
+
+
 def _read_table(
     path: pathlib.Path, needed: str | None, remarks: list[str]
 ) -> dict[str, np.ndarray]:
-    """Reads eval.csv or train.csv; says in `remarks` why it can't."""
+    """Reads eval.csv or train.csv; adds to `remarks` why that fails."""
     columns = ["frame", *([needed] if needed else [])]
     empty = {column: np.zeros(0) for column in columns}
     try:
+        archive.open_regular(path).close()
         table = tables.read_csv(path)
         missing = [column for column in columns if column not in table]
         if missing:
@@ -237,16 +261,18 @@ def _read_table(
         remarks.append(f"no {path.name}")
         return empty
     except OSError as error:
-        remarks.append(f"{path.name} can't be read ({error.strerror})")
+        remarks.append(f"{path.name} cannot be read ({error.strerror})")
         return empty
     except ValueError as error:
-        reason = str(error).removeprefix(f"{path}: ")
+        reason = str(error).removeprefix(f"{path}: ")[:_MAX_REASON]
         remarks.append(f"{path.name} is damaged ({reason})")
         return empty
+    for values in table.values():
+        values[np.abs(values) > LARGEST] = np.nan
     good = np.all([np.isfinite(table[column]) for column in columns], axis=0)
     if not good.all():
         remarks.append(f"{path.name}: {int((~good).sum())} rows without a number")
-    # The last row of a frame counts: that is what a resumed run wrote anew.
+    # The last row of a frame counts: a resumed run wrote it again.
     frames = table["frame"][good]
     _, backwards = np.unique(frames[::-1], return_index=True)
     order = len(frames) - 1 - backwards

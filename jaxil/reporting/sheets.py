@@ -6,10 +6,11 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from jaxil.reporting.appearance import INK, Look
+from jaxil.reporting.groups import Look
+from jaxil.reporting.plots import INK
 
-# In inches. Places are computed, not found by Matplotlib's layout engines, which take
-# twice as long as all the drawing.
+# In inches. Positions are computed, since Matplotlib's layout engines take twice as
+# long as everything else.
 _WIDTH, _HEIGHT = 4.3, 2.85  # of a panel
 _MARGINS = (0.64, 0.14)  # left and right of the axes
 _TOP, _TITLE, _BOTTOM = 0.12, 0.24, 0.46  # above and below them
@@ -41,7 +42,7 @@ class Panel(NamedTuple):
 
     Attributes:
       title: such as the task.
-      draw: draws it onto Matplotlib's axes.
+      draw: plots it onto Matplotlib's axes.
       height: in inches.
       margins: left and right of the axes, in inches.
     """
@@ -72,7 +73,7 @@ def inline_svg(panel: Panel, prefix: str) -> str:
     """Returns a panel as an <svg> element in the page's colour and font.
 
     Args:
-      panel: what to draw.
+      panel: what to plot.
       prefix: of all ids in it, unique on the page.
     """
     with _context({"svg.fonttype": "none"}):
@@ -101,16 +102,6 @@ def write(sheet: Sheet, folder: pathlib.Path) -> None:
             (folder / f"{sheet.name}.{kind}").write_bytes(_saved(figure, kind))
 
 
-def swatch(look: Look) -> str:
-    """Returns a short line in a variant's look, as an <svg> element."""
-    dashes = " ".join(f"{2 * length:g}" for length in look.dashes) or "none"
-    return (
-        '<svg class="swatch" viewBox="0 0 34 10" aria-hidden="true">'
-        f'<line x1="1" y1="5" x2="33" y2="5" stroke="{look.colour}" stroke-width="3" '
-        f'stroke-dasharray="{dashes}"/></svg>'
-    )
-
-
 def _context(more: dict[Any, Any]) -> Any:
     import matplotlib
 
@@ -123,7 +114,7 @@ def _figure(
     *,
     title: float,
 ) -> tuple[Any, list[Any]]:
-    """Returns a figure with axes for each panel, all equally high, and its legend."""
+    """Returns a figure with axes for each panel, and its legend."""
     # Not pyplot: a Figure of one's own needs no display and leaves no global state.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -139,17 +130,12 @@ def _figure(
     figure = Figure(figsize=(width, height), dpi=150)
     FigureCanvasAgg(figure)
     axes = []
-    for place, panel in enumerate(panels):
-        row, column = divmod(place, columns)
+    for index, panel in enumerate(panels):
+        row, column = divmod(index, columns)
         left, right = panel.margins
-        corner = (column * _WIDTH + left, height - (row + 1) * cell + _BOTTOM)
-        size = (_WIDTH - left - right, cell - title - _TOP - _BOTTOM)
-        box = (
-            corner[0] / width,
-            corner[1] / height,
-            size[0] / width,
-            size[1] / height,
-        )
+        across, high = _WIDTH - left - right, panel.height - _TOP - _BOTTOM
+        x, y = column * _WIDTH + left, height - row * cell - title - _TOP - high
+        box = (x / width, y / height, across / width, high / height)
         axes.append(figure.add_axes(box))
     if legend:
         handles = [

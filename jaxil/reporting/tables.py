@@ -1,95 +1,101 @@
-"""A table as CSV, exact, and as HTML, for people."""
+"""The report's tables: rows of cells, as exact CSV and as text for people."""
 
 import csv
-import html
 import io
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-Kind = Literal["text", "count", "return", "share", "hours"]
-_MISSING = "–"
-_MEDIUM, _LONG = 16, 60  # characters; a cell with more needs room
+from jaxil.reporting import statistics
+from jaxil.reporting.groups import Group, changes
+from jaxil.reporting.measures import LEVELS, Curve, Final, arrivals
+from jaxil.reporting.statistics import Estimate
 
-
-class Column(NamedTuple):
-    """One column.
-
-    Attributes:
-      key: its name in the CSV file.
-      title: its name on the page.
-      kind: what it holds; all but text is right-aligned.
-    """
-
-    key: str
-    title: str
-    kind: Kind = "text"
+_NAN = float("nan")
+_PERCENTS = [f"{level * 100:.0f}" for level in LEVELS]
+# Columns of numbers with their formats on the page, and titles that are not the name.
+_COUNTS = ["runs", "tasks", "finished", "unfinished", "empty", "seed", "frames"]
+_COUNTS += [f"frames_{percent}" for percent in _PERCENTS]
+_RETURNS = ["mean", "mean_low", "mean_high", "iqm", "iqm_low", "iqm_high", "median"]
+_RETURNS += ["expert", "expert_return", "last_return", "best_return"]
+_RETURNS += ["frames_per_second"]
+_SHARES = ["share_of_expert", *(f"reached_{percent}" for percent in _PERCENTS)]
+_HOURS = ["hours", *(f"hours_{percent}" for percent in _PERCENTS)]
+_FORMATS = {
+    **dict.fromkeys(_COUNTS, ",.0f"),
+    **dict.fromkeys(_RETURNS, ".1f"),
+    **dict.fromkeys(_SHARES, ".0%"),
+    **dict.fromkeys(_HOURS, ".2f"),
+}
+_TITLES = {
+    "share_of_expert": "of the expert",
+    "frames_per_second": "frames/s",
+    "iqm": "IQM",
+    "mean_low": "90 % from",
+    "mean_high": "to",
+    "iqm_low": "90 % from",
+    "iqm_high": "to",
+    **{f"reached_{percent}": f"reached {percent} %" for percent in _PERCENTS},
+    **{f"frames_{percent}": f"{percent} % after frames" for percent in _PERCENTS},
+    **{f"hours_{percent}": f"{percent} % after hours" for percent in _PERCENTS},
+}
 
 
 class Table(NamedTuple):
-    """Rows of cells; None and NaN are missing.
+    """Rows of cells by their column's name in the CSV file; None and NaN are missing.
 
     Attributes:
       name: of its file.
-      columns: what the cells are.
-      rows: as long as `columns`.
+      title: on the page.
+      rows: all with the same columns, at least one.
+      about: how to read it.
+      in_shares: whether its means are shares of an expert's return.
     """
 
     name: str
-    columns: tuple[Column, ...]
-    rows: Sequence[Sequence[Any]]
+    title: str
+    rows: Sequence[dict[str, Any]]
+    about: str = ""
+    in_shares: bool = False
+
+    @property
+    def columns(self) -> list[str]:
+        """The columns' names."""
+        return list(self.rows[0])
 
 
 def to_csv(table: Table) -> bytes:
     """Returns the table with every digit; missing cells are empty."""
     stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow([column.key for column in table.columns])
-    for row in table.rows:
-        writer.writerow([_exact(cell) for cell in row])
-    return stream.getvalue().encode()
+    writer = csv.DictWriter(stream, table.columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({k: exact(cell) for k, cell in row.items()} for row in table.rows)
+    return stream.getvalue().encode(errors="replace")
 
 
-def to_html(table: Table) -> str:
-    """Returns the table in a box that scrolls when it is wider than the page."""
-    head = "".join(
-        f'<th scope="col"{_align(column)}>{html.escape(column.title)}</th>'
-        for column in table.columns
-    )
-    body = "\n".join(f"<tr>{_row(table.columns, row)}</tr>" for row in table.rows)
-    return (
-        f'<div class="scroll" tabindex="0"><table data-name="{table.name}">'
-        f"<thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>"
-    )
+def title(column: str) -> str:
+    """Returns a column's name on the page."""
+    return _TITLES.get(column, column.replace("_", " "))
 
 
-def _row(columns: Sequence[Column], row: Sequence[Any]) -> str:
-    cells = []
-    for column, cell in zip(columns, row, strict=True):
-        key = "" if _is_missing(cell) else html.escape(str(_exact(cell)), quote=True)
-        text = html.escape(_shown(cell, column.kind))
-        kind = _align(column) or _room(text)
-        cells.append(f'<td{kind} data-sort="{key}">{text}</td>')
-    return "".join(cells)
+def is_number(column: str) -> bool:
+    """Returns whether a column holds numbers."""
+    return column in _FORMATS
 
 
-def _room(text: str) -> str:
-    if len(text) > _LONG:
-        return ' class="long"'
-    return ' class="medium"' if len(text) > _MEDIUM else ""
+def shown(table: Table, column: str, cell: Any) -> str:
+    """Returns a cell as people read it."""
+    if _is_missing(cell):
+        return "–"
+    kind = _FORMATS.get(column, "")
+    if table.in_shares and column in _RETURNS:
+        kind = ".0%"
+    return f"{cell:{kind}}".replace("%", " %") if kind else str(cell)
 
 
-def _align(column: Column) -> str:
-    return "" if column.kind == "text" else ' class="number"'
-
-
-def _is_missing(cell: Any) -> bool:
-    is_number = isinstance(cell, float | np.floating | np.ndarray)
-    return cell is None or (is_number and bool(np.isnan(cell)))
-
-
-def _exact(cell: Any) -> Any:
+def exact(cell: Any) -> Any:
+    """Returns a cell with every digit; "" if it is missing."""
     if _is_missing(cell):
         return ""
     if isinstance(cell, float | np.floating | np.ndarray):
@@ -99,15 +105,177 @@ def _exact(cell: Any) -> Any:
     return cell
 
 
-def _shown(cell: Any, kind: Kind) -> str:
-    if _is_missing(cell):
-        return _MISSING
-    if kind == "count":
-        return f"{cell:,.0f}"
-    if kind == "return":
-        return f"{cell:.1f}"
-    if kind == "share":
-        return f"{100 * cell:.0f} %"
-    if kind == "hours":
-        return f"{cell:.2f}"
-    return str(cell)
+def _is_missing(cell: Any) -> bool:
+    number = isinstance(cell, float | np.floating | np.ndarray)
+    return cell is None or (number and bool(np.isnan(cell)))
+
+
+def curve_table(name: str, curves: Sequence[Curve], over: str) -> Table:
+    """Returns the points of the curves; `over` is "frame" or "hours"."""
+    rows = []
+    for line in curves:
+        points = zip(line.x, line.count, *line.mean, strict=True)
+        for x, count, mean, low, high in points:
+            row = {"task": line.group.task, "variant": line.group.label, over: x}
+            row |= {"seeds": int(count), "mean": mean, "low": low, "high": high}
+            rows.append(row)
+    return Table(name, name, rows)
+
+
+def final_table(finals: Sequence[Final]) -> Table:
+    """Returns the last returns of each group."""
+    rows = [
+        {
+            "task": each.group.task,
+            "variant": each.group.label,
+            "runs": len(each.returns),
+            "finished": each.group.num_finished,
+            **_interval("mean", each.mean),
+            **_interval("iqm", statistics.interquartile_interval([each.returns])),
+            "median": np.median(each.returns),
+            "expert": each.expert,
+            "share_of_expert": each.mean.value / each.expert
+            if each.expert > 0
+            else _NAN,
+        }
+        for each in finals
+    ]
+    about = (
+        "The paper averages the last ten episodes; this is the last evaluation, of as "
+        "many episodes as num_eval_episodes says (default: 10), by the mean action. "
+        "IQM is the interquartile mean, with a bootstrap interval over seeds."
+    )
+    return Table("final_returns", "Final returns", rows, about)
+
+
+def aggregate_table(finals: Sequence[Final]) -> Table:
+    """Returns each variant over its tasks, at least two, in shares of their experts."""
+    labels: dict[str, list[np.ndarray]] = {}
+    for each in finals:
+        if each.expert > 0:
+            labels.setdefault(each.group.label, []).append(each.returns / each.expert)
+    rows = []
+    for label, strata in labels.items():
+        if len(strata) < 2:
+            continue
+        scores = np.concatenate(strata)
+        row = {"variant": label, "tasks": len(strata), "runs": len(scores)}
+        row |= _interval("iqm", statistics.interquartile_interval(strata))
+        rows.append({**row, "median": np.median(scores), "mean": scores.mean()})
+    about = (
+        "Seeds are resampled within each task (stratified bootstrap). Variants with "
+        "runs on different tasks cannot be compared here."
+    )
+    name = "Over all tasks, in shares of each expert"
+    return Table("all_tasks", name, rows, about, in_shares=True)
+
+
+def efficiency_table(groups: Sequence[Group]) -> Table:
+    """Returns how soon each group was as good as shares of its expert."""
+    rows = []
+    for group in groups:
+        runs = group.measured
+        if not runs:
+            continue
+        frames = [arrivals(run, "frame") for run in runs]
+        hours = [arrivals(run, "hours") for run in runs]
+        has_expert = any(np.isfinite(run.expert_return) for run in runs)
+        row = {"task": group.task, "variant": group.label, "runs": len(runs)}
+        for k, percent in enumerate(_PERCENTS):
+            reached = np.isfinite([each[k] for each in frames]).mean()
+            row[f"reached_{percent}"] = reached if has_expert else _NAN
+            for unit, times in (("frames", frames), ("hours", hours)):
+                median = statistics.median_until([each[k] for each in times])
+                row[f"{unit}_{percent}"] = median
+        speeds = [run.frames_per_second for run in runs]
+        rows.append({**row, "frames_per_second": np.median(speeds)})
+    about = (
+        "When an evaluation first reached a share of the expert's return: the share of "
+        "seeds that did, and the median over seeds, where those that never did count "
+        "as later than all others. Frames per second include evaluations."
+    )
+    return Table("sample_efficiency", "Sample efficiency", rows, about)
+
+
+def seed_table(groups: Sequence[Group], num_seeds: int | None) -> Table:
+    """Returns which seeds each variant has on each task.
+
+    Args:
+      groups: of all runs.
+      num_seeds: lists which of seeds 0 to num_seeds - 1 are missing; None: asks none.
+    """
+    rows = []
+    for group in groups:
+        seeds = sorted({run.seed for run in group.runs})
+        empty = sum(run.frames == 0 for run in group.runs)
+        row = {
+            "task": group.task,
+            "variant": group.label,
+            "seeds": _ranges(seeds),
+            "finished": group.num_finished,
+            "unfinished": len(group.runs) - group.num_finished - empty,
+            "empty": empty,
+        }
+        if num_seeds is not None:
+            row["missing"] = _ranges(sorted(set(range(num_seeds)) - set(seeds)))
+        rows.append(row)
+    return Table("seeds", "Seeds", rows)
+
+
+def settings_table(groups: Sequence[Group]) -> Table:
+    """Returns what the words and letters behind a variant's name stand for."""
+    settings = {g.label: ", ".join(g.settings) for g in groups if g.settings}
+    rows = [{"variant": label, "settings": text} for label, text in settings.items()]
+    return Table("settings", "Settings of variants", rows)
+
+
+def run_table(groups: Sequence[Group]) -> Table:
+    """Returns one row for each run."""
+    runs = [(group, run) for group in groups for run in group.runs]
+    shared = shared_changes(groups)
+    rows = []
+    for group, run in runs:
+        own = {k: v for k, v in changes(run).items() if k not in shared}
+        row = {
+            "folder": run.name,
+            "task": run.task,
+            "variant": group.label,
+            "seed": run.seed,
+            "state": run.state,
+            "frames": run.frames,
+            "hours": run.seconds / 3600,
+            "frames_per_second": run.frames_per_second,
+            "last_return": run.returns[-1] if len(run.returns) else _NAN,
+            "best_return": run.returns.max() if len(run.returns) else _NAN,
+            "expert_return": run.expert_return,
+        }
+        for percent, frames in zip(_PERCENTS, arrivals(run, "frame"), strict=True):
+            row[f"frames_{percent}"] = frames
+        row["device"] = run.device
+        row["settings"] = ", ".join(f"{k}={v}" for k, v in own.items())
+        row["remarks"] = "; ".join(run.remarks)
+        rows.append(row)
+    about = "Settings are those that differ from the paper's and not in all runs."
+    return Table("runs", "Runs", rows, about)
+
+
+def shared_changes(groups: Sequence[Group]) -> dict[str, Any]:
+    """Returns the settings, not the paper's, that all runs have in common."""
+    first, *others = [changes(run) for group in groups for run in group.runs]
+    return {k: v for k, v in first.items() if all(o.get(k) == v for o in others)}
+
+
+def _interval(key: str, estimate: Estimate) -> dict[str, Any]:
+    value, low, high = estimate
+    return {key: value, f"{key}_low": low, f"{key}_high": high}
+
+
+def _ranges(numbers: list[int]) -> str:
+    """Writes [0, 1, 2, 5] as "0-2, 5"."""
+    parts: list[list[int]] = []
+    for number in numbers:
+        if parts and parts[-1][-1] == number - 1:
+            parts[-1].append(number)
+        else:
+            parts.append([number])
+    return ", ".join(f"{p[0]}-{p[-1]}" if len(p) > 1 else str(p[0]) for p in parts)

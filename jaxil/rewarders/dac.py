@@ -9,7 +9,7 @@ from jax import Array
 from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, AgentView, Rewarder, Spec
 from jaxil.learner.state import LearnerParams, ModuleState, init_module
-from jaxil.maths import augmentation
+from jaxil.maths import stacking
 from jaxil.maths.types import (
     Batch,
     Episode,
@@ -132,7 +132,7 @@ def make_rewarder(
     ) -> Array:
         # For the log only: the agent learns from `relabel`.
         del learner, expert_episodes
-        observations = augmentation.stack_frames(
+        observations = stacking.stack_frames(
             episode.frames, frame_stack=agent.frame_stack
         )
         x = inputs(observations[:-1], jnp.asarray(episode.actions))

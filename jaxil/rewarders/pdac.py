@@ -9,7 +9,7 @@ from jax import Array
 from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, AgentView, Rewarder, Spec
 from jaxil.learner.state import LearnerParams, ModuleState, init_module
-from jaxil.maths import augmentation
+from jaxil.maths import augmentation, stacking
 from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes, Metrics, Params
 from jaxil.networks.agent import apply, critic_features
 from jaxil.networks.discriminator import Discriminator
@@ -116,7 +116,7 @@ def make_rewarder(
         expert_episodes: ExpertEpisodes | None,
     ) -> Array:
         del expert_episodes
-        observations = augmentation.stack_frames(
+        observations = stacking.stack_frames(
             episode.frames, frame_stack=agent.frame_stack
         )
         # r(o_{t+1}), as in the reference; with actions the pair is (o_t, a_t).

@@ -15,7 +15,7 @@ from jaxil.learner.state import (
     apply_gradients,
     init_module,
 )
-from jaxil.maths import augmentation, transport
+from jaxil.maths import stacking, transport
 from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes, Metrics, Params
 from jaxil.networks.agent import apply
 from jaxil.networks.discriminator import Embedding
@@ -96,7 +96,7 @@ def make_rewarder(
     optimiser = optax.adam(learning_rate)
 
     def embed(params: Params, frames: Array) -> Array:
-        observations = augmentation.stack_frames(frames, frame_stack=agent.frame_stack)
+        observations = stacking.stack_frames(frames, frame_stack=agent.frame_stack)
         return apply(embedding, params, observations)
 
     def init(key: Array, spec: Spec, learner: LearnerParams) -> SilState:

@@ -9,7 +9,7 @@ from jax import Array
 
 from jaxil.learner.rewarder import AgentSpec, Rewarder, Spec
 from jaxil.learner.state import LearnerParams, copy_params
-from jaxil.maths import augmentation
+from jaxil.maths import stacking
 from jaxil.maths.types import Episode, ExpertEpisodes, Params
 from jaxil.networks.agent import actor_features
 from jaxil.rewarders.matching import scale_of_first_episode
@@ -61,7 +61,7 @@ def make_target_rewarder(
     """
 
     def embed(encoder: Params, actor: Params, frames: Array) -> Array:
-        observations = augmentation.stack_frames(frames, frame_stack=agent.frame_stack)
+        observations = stacking.stack_frames(frames, frame_stack=agent.frame_stack)
         return actor_features(agent.networks, encoder, actor, observations)
 
     def init(key: Array, spec: Spec, learner: LearnerParams) -> TargetState:
@@ -159,5 +159,7 @@ def make_target_rewarder(
         matches_episodes=True,
         rewards_changed=lambda state: state.steps_since_copy == 0,
         plan=None if plan is None else plan_of,
-        summary=lambda state: {"sinkhorn/scale": state.scale},
+        summary=lambda state: (
+            {} if return_scale is None else {"sinkhorn/scale": state.scale}
+        ),
     )

@@ -1,1 +1,1 @@
-"""What `jaxil.benchmark` measures, and how it shows the results."""
+"""The measurements and tables of `jaxil.benchmark`."""

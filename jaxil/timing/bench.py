@@ -1,7 +1,4 @@
-"""A run whose parts can be called one at a time.
-
-The only file of this folder that knows how a run is assembled.
-"""
+"""A run whose parts can be called one at a time."""
 
 import io
 import pathlib
@@ -21,11 +18,11 @@ from jaxil.training import assembly
 from jaxil.training.parts import make_parts
 
 _EPISODE_STEPS = 500  # of tasks without a limit
-_RENDERED_FRAMES = 20  # of the random episode; rendering 500 would dominate all else
+_RENDERED_FRAMES = 20  # of the random episode; rendering 500 would take too long
 
 
 class _Loop(train.Run):
-    """A run that only acts and learns: it neither evaluates nor saves."""
+    """A run that neither evaluates nor saves."""
 
     waits = False  # whether the environment waits for each update
 
@@ -35,7 +32,7 @@ class _Loop(train.Run):
             jax.block_until_ready(self.state.num_updates)
 
     def wants_episode(self, number: int) -> bool:
-        del number  # the budget is less than an episode, and one begins all the same
+        del number  # even if the budget is less than an episode
         return True
 
     def evaluate(self) -> None:
@@ -49,28 +46,23 @@ class Bench:
     """A run that has stored one episode of random actions and updated once.
 
     Attributes:
-      config: of the run; its loop acts and learns from the first agent step.
-      episode: the random one, Episode.
-      batches: what one update learns from, on the host: agent's and experts'.
-      first_update_seconds: of the first update, compilation included.
+      run: acts and learns from the first agent step.
+      config: of the run.
+      episode: the random one.
+      batches: the agent's and the experts' batch of one update, on the host.
+      first_update_seconds: includes compilation.
     """
 
     def __init__(
         self, config: Config, folder: pathlib.Path, say: Callable[[str], None]
     ) -> None:
-        """Starts the run.
-
-        Args:
-          config: checked; copied.
-          folder: of the run.
-          say: receives lines for the user.
-        """
+        """Starts the run of a checked config in a folder; `say` prints a line."""
         self.config = config = config.copy_and_resolve_references()
         with config.unlocked():
             config.exploration_steps = 0
             config.seed_frames = config.total_frames = config.action_repeat
         self._demonstrations = assembly.load_demonstrations(config)
-        self._run = run = _Loop(**make_parts(config, folder, self._demonstrations, say))
+        self.run = run = _Loop(**make_parts(config, folder, self._demonstrations, say))
         self._environment = assembly.training_environment(config)
         run.progress = ProgressLine(config.total_frames, stream=io.StringIO())
         self._rng = np.random.default_rng(0)
@@ -78,7 +70,7 @@ class Bench:
         self.observation = self._environment.reset(episode=0).observation
         self.add_episode()
         self.batches = self.sample()
-        # A run may send several updates to the device at once.
+        # A run may dispatch several updates at once.
         self._several = config.updates_per_dispatch
         dispatched: Any = self.batches
         if self._several > 1:
@@ -89,13 +81,13 @@ class Bench:
         jax.block_until_ready(self.update())
         self.first_update_seconds = time.perf_counter() - begin
         if run.player is not None and config.num_environments > 1:
-            # Start the processes and compile their policy before anything is timed.
+            # Start the workers and compile their policy before anything is timed.
             run.player.begin(lambda _: True)
             run.act(run.player.observations)
 
     def parts(self) -> dict[str, tuple[Callable[[], Any], int]]:
-        """Returns the parts of a run by name, and how often a call does its work."""
-        run, config = self._run, self.config
+        """Returns the parts of a run by name, and how often one call executes each."""
+        run, config = self.run, self.config
         is_state = config.observation == "state"
         render = (
             self._environment.frame if is_state else self._environment.renderer.render
@@ -111,11 +103,11 @@ class Bench:
 
     def sample(self) -> Any:
         """Returns the batches of one update."""
-        return self._run.updates.sample(self._rng)
+        return self.run.updates.sample(self._rng)
 
     def update(self) -> Any:
-        """Updates as often as a run does in one dispatch; returns the new state."""
-        run, agent = self._run, self._run.agent
+        """Dispatches updates like a run; returns the new state."""
+        run, agent = self.run, self.run.agent
         step = agent.repeated_step if self._several > 1 else agent.update_step
         run.state, run.counters.metrics = step(
             run.state, *self._on_device, run.updates.frames()
@@ -124,8 +116,8 @@ class Bench:
 
     def add_episode(self) -> None:
         """Stores the random episode."""
-        self._run.replay.add_episode(**self.episode._asdict())
-        self._run.updates.episode_added()
+        self.run.replay.add_episode(**self.episode._asdict())
+        self.run.updates.episode_added()
 
     def fill_replay(self) -> None:
         """Stores episodes until the replay is full, then updates."""
@@ -134,35 +126,29 @@ class Bench:
         jax.block_until_ready(self.update())
 
     def loop(self, steps: int, *, waits: bool) -> tuple[int, float, float]:
-        """Acts and learns for a number of agent steps of all environments together.
+        """Acts and learns for `steps` agent steps, summed over all environments.
 
-        Args:
-          steps: at least 1.
-          waits: whether environments stand still during updates.
+        With `waits`, environments wait for each update.
 
         Returns:
-          Environment frames, seconds, and how many of those went into environments,
-          acting and updating.
+          Environment frames, seconds, and the seconds of environments, acting and
+          updates alone.
         """
-        run, first_frame = self._run, self._run.frame
+        run, first_frame = self.run, self.run.frame
         run.waits, before = waits, sum(run.stopwatch.seconds.values())
         with self.config.unlocked():
             self.config.total_frames = first_frame + steps * self.config.action_repeat
         begin = time.perf_counter()
         run.loop(whole_episodes=False)
-        # The last update may still be running.
+        # The last update may not have finished.
         run.stopwatch.timed("update", jax.block_until_ready)(run.state.num_updates)
         seconds = time.perf_counter() - begin
         working = sum(run.stopwatch.seconds.values()) - before
         return run.frame - first_frame, seconds, working
 
     def lower(self, *, convolutions: str | None = None) -> Any:
-        """Traces one update anew for the compiler.
-
-        Args:
-          convolutions: as in the config, if not the run's own.
-        """
-        run, agent = self._run, self._run.agent
+        """Traces and lowers one update, if given with other `convolutions`."""
+        run, agent = self.run, self.run.agent
         if convolutions is not None:
             config = self.config.copy_and_resolve_references()
             with config.unlocked():
@@ -174,21 +160,13 @@ class Bench:
         )
         return agent.update_step.lower(*shapes)
 
-    def replay_bytes(self) -> int:
-        """Returns the size of the frames of a full replay."""
-        return self._run.replay.frames.nbytes
-
-    def state_bytes(self) -> int:
-        """Returns the size of the learner's state, with optimisers and rewarder."""
-        return num_bytes(self._run.state)
-
     def close(self) -> None:
-        """Ends the processes of environments and closes files."""
-        self._run.close()
-        self._run.log.close()
+        """Ends worker processes and closes files."""
+        self.run.close()
+        self.run.log.close()
 
     def _physics_step(self) -> Callable[[], Any]:
-        """Returns an environment's step without rendering."""
+        """Returns a function that steps an environment without rendering."""
         config = self.config.copy_and_resolve_references()
         with config.unlocked():
             config.observation = "state"

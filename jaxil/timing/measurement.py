@@ -1,26 +1,27 @@
-"""The parts of a run, measured one after the other, then the loop that joins them."""
+"""Measures the parts of a run one by one, then the whole loop."""
 
 import contextlib
 import functools
 import pathlib
 import sys
 import tempfile
-from collections.abc import Mapping
-from typing import Any
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxil.config import Config
 from jaxil.machine import devices, memory
 from jaxil.timing import start
 from jaxil.timing.bench import Bench, num_bytes
-from jaxil.timing.clock import timed
 
-_TURNS = 4  # between the loop's two forms
+_TURNS = 4  # the loop's two forms alternate
 _SHORT_PARTS = ("physics_ms", "render_ms", "act_ms")  # get ten times the repeats
-# Sizes of matrix products, tried until one takes this long: small ones leave large
-# devices idle, large ones take small devices minutes.
+# Sizes of matrix products, increased until one takes `_LONG_SECONDS`: small ones do not
+# fill large devices, large ones take minutes on small devices.
 _PRODUCT_SIZES = (512, 1024, 2048, 4096, 8192)
 _LONG_SECONDS = 0.05
 
@@ -37,15 +38,15 @@ def measure(
 
     Args:
       config: checked.
-      repeats: timings of each part, of which the median counts.
-      steps: agent steps that are timed of each of the loop's two forms.
-      environment: variables of the process that start-up is timed in; None skips this
-        and compiling without a cache.
-      full: whether the replay is filled before memory is measured.
+      repeats: timings of each part; the median is reported.
+      steps: agent steps to time for each of the loop's two forms.
+      environment: variables of the process whose start is timed; None skips this and
+        compilation without a cache.
+      full: whether to fill the replay before memory is measured.
 
     Returns:
-      All rows of `tables.ROWS`, None where one does not apply; `ranges`, lowest and
-      highest by row; the machine; the config.
+      All rows of `tables.ROWS`, None if not applicable; `ranges`, lowest and highest
+      by row; the machine; the config.
     """
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -83,7 +84,7 @@ def measure(
 
 
 def _time_loop(bench: Bench, steps: int) -> dict[str, float]:
-    """Times the loop as it is and with environments that wait for updates, in turn."""
+    """Alternates between the loop and a form whose environments wait for updates."""
     totals = {False: [0.0] * 3, True: [0.0] * 3}
     for turn in range(_TURNS):
         share = steps * (turn + 1) // _TURNS - steps * turn // _TURNS
@@ -102,17 +103,17 @@ def _memory(bench: Bench) -> dict[str, float | None]:
     program = bench.lower().compile().memory_analysis()
     on_device = devices.peak_bytes()
     return {
-        "learner_state_mb": bench.state_bytes() / 1e6,
+        "learner_state_mb": num_bytes(bench.run.state) / 1e6,
         "batch_mb": num_bytes(bench.batches) / 1e6,
         "update_temp_mb": getattr(program, "temp_size_in_bytes", 0) / 1e6,
-        "replay_gb": bench.replay_bytes() / 1e9,
+        "replay_gb": bench.run.replay.frames.nbytes / 1e9,
         "peak_memory_gb": memory.peak_bytes() / 1e9,
         "peak_device_memory_gb": None if on_device is None else on_device / 1e9,
     }
 
 
 def _arithmetic(bench: Bench, update_ms: float) -> dict[str, float]:
-    # XLA cannot see into the encoder in C, so it counts its own convolutions instead.
+    # XLA cannot count the operations of the encoder in C, so use its own convolutions.
     cost = bench.lower(convolutions="xla").cost_analysis()
     peak = _product_flops_per_second()
     return {
@@ -123,9 +124,9 @@ def _arithmetic(bench: Bench, update_ms: float) -> dict[str, float]:
 
 
 def _product_flops_per_second() -> float:
-    """Returns the rate of the best of several matrix products.
+    """Returns the best rate of several matrix products.
 
-    At jax's default precision, as in the update: TF32 on newer NVIDIA devices.
+    They use jax's default precision, like the update: TF32 on newer NVIDIA devices.
     """
     multiply, best = jax.jit(jnp.matmul), 0.0
     for size in _PRODUCT_SIZES:
@@ -135,6 +136,25 @@ def _product_flops_per_second() -> float:
         if seconds > _LONG_SECONDS:
             break
     return best
+
+
+class Timing(NamedTuple):
+    """Seconds per call."""
+
+    median: float  # not the mean: other processes only add time
+    low: float
+    high: float
+
+
+def timed(function: Callable[[], Any], repeats: int) -> Timing:
+    """Times a function until its result is ready, after a call that may compile."""
+    jax.block_until_ready(function())
+    seconds = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        jax.block_until_ready(function())
+        seconds.append(time.perf_counter() - begin)
+    return Timing(float(np.median(seconds)), min(seconds), max(seconds))
 
 
 def _say(text: str) -> None:

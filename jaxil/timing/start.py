@@ -1,4 +1,4 @@
-"""How long a run takes to start: to its first step, and to compile its update."""
+"""Times the start of a run: to its first step, and compiling its update."""
 
 import json
 import pathlib
@@ -15,7 +15,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from jaxil.config import Config
 
 _TIMEOUT_SECONDS = 600.0  # it takes 20 s on two busy cores
-# A run that ends at its first step, printing the time on a clock that processes share.
+# A run that prints the system's monotonic clock at its first step and exits.
 _RUN = """
 import json, os, sys, time
 from jaxil.machine import startup
@@ -43,13 +43,11 @@ def first_step_seconds(
 ) -> float | None:
     """Returns the time from the command to the first step, with warm caches.
 
-    Args:
-      config: checked.
-      environment: variables that the user has set.
-      say: receives a line if the run failed; the result is None then.
+    `environment` are the user's variables. If the run fails, prints a line with `say`
+    and returns None.
     """
     settings = config.to_dict()
-    settings["num_environments"] = 1  # so that the process itself steps
+    settings["num_environments"] = 1  # so that this process steps it
     with tempfile.TemporaryDirectory() as folder:
         file = pathlib.Path(folder, "config.py")
         file.write_text(_CONFIG_FILE.format(json.dumps(settings)))
@@ -76,15 +74,15 @@ def first_step_seconds(
 
 
 def compile_seconds(lower: Callable[[], Any]) -> float:
-    """Returns the time to trace and compile a program, with nothing cached.
+    """Returns the time to trace and compile a program without caches.
 
-    This process forgets all its compiled programs, so call it last.
+    Clears the compiled programs of this process, so call it last.
     """
     jax.clear_caches()
     before = jax.config.values["jax_enable_compilation_cache"]
     try:
         jax.config.update("jax_enable_compilation_cache", False)
-        compilation_cache.reset_cache()  # jax looks at the setting only once
+        compilation_cache.reset_cache()  # jax reads the setting only once
         begin = time.perf_counter()
         lower().compile()
         return time.perf_counter() - begin

@@ -1,4 +1,4 @@
-"""Results as tables: one measurement, two side by side, or a sweep."""
+"""Tables of results: one measurement, a comparison, or a sweep."""
 
 import json
 import pathlib
@@ -9,7 +9,7 @@ from flax.traverse_util import flatten_dict
 
 from jaxil.errors import UsageError
 
-# Section, then row and what it means.
+# The meaning of each row, by section.
 ROWS: dict[str, dict[str, str]] = {
     "time of each part (median, lowest, highest)": {
         "physics_ms": "one agent step, without rendering",
@@ -49,13 +49,13 @@ _SWEEP_COLUMNS = (
     *("update_ms", "reward_ms", "sample_ms", "frames_per_second"),
     *("update_gflop", "utilisation_percent", "batch_mb", "update_temp_mb"),
 )
-# In each results file, whatever version wrote it.
+# Present in results files of all versions.
 _ALWAYS = {"update_ms": int | float, "device": str, "config": dict}
 _CIRCUMSTANCES = ("device", "num_devices", "processor", "usable_cores", "machine")
 
 
 def results_table(results: Mapping[str, Any]) -> str:
-    """Returns all rows that have a value."""
+    """Returns a table of all rows that have a value."""
     lines = [machine_line(results)]
     for section, rows in ROWS.items():
         lines += ["", section]
@@ -67,7 +67,7 @@ def results_table(results: Mapping[str, Any]) -> str:
 
 
 def machine_line(results: Mapping[str, Any]) -> str:
-    """Names what was measured on, in one line."""
+    """Describes the machine in one line."""
     return (
         f"{results['num_devices']} x {results['device']}; {results['processor']}, "
         f"{results['usable_cores']} of {results['cores']} cores usable; "
@@ -76,7 +76,7 @@ def machine_line(results: Mapping[str, Any]) -> str:
 
 
 def sweep_table(all_results: Sequence[Mapping[str, Any]]) -> str:
-    """Returns a line for each value of a swept field."""
+    """Returns a table with a line for each value of the swept field."""
     field = all_results[0]["sweep"]["field"]
     lines = ["".join(f"{name:>{len(name) + 2}}" for name in (field, *_SWEEP_COLUMNS))]
     for results in all_results:
@@ -88,11 +88,7 @@ def sweep_table(all_results: Sequence[Mapping[str, Any]]) -> str:
 
 
 def read(path: str) -> dict[str, Any]:
-    """Returns the results in a file that `--json` wrote.
-
-    Raises:
-      UsageError: it holds none.
-    """
+    """Reads results that `--json` wrote; UsageError if the file has none."""
     try:
         results = json.loads(pathlib.Path(path).read_text())
         if not all(isinstance(results[name], kind) for name, kind in _ALWAYS.items()):
@@ -106,7 +102,7 @@ def read(path: str) -> dict[str, Any]:
 
 
 def comparison_table(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    """Returns old, new and new / old of each row that both have."""
+    """Returns a table of old, new and new / old for each row that both have."""
     lines = [f"{'':<28}{'old':>10}{'new':>10}{'new/old':>10}"]
     for name in (name for rows in ROWS.values() for name in rows):
         before, now = old.get(name), new.get(name)
@@ -117,7 +113,7 @@ def comparison_table(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Names what else differs: device, machine, fields of the config."""
+    """Returns the differences in device, machine and config fields."""
     before, now = (
         {name: each.get(name) for name in _CIRCUMSTANCES if name in old}
         | flatten_dict({"config": json.loads(json.dumps(each["config"]))}, sep=".")
@@ -136,7 +132,7 @@ def _cells(*numbers: float | None) -> str:
 
 
 def _number(value: float | None) -> str:
-    """Writes a number with about four digits; nothing for None."""
+    """Formats a number with about four digits; "" for None."""
     if value is None:
         return ""
     if abs(value) >= 1000:

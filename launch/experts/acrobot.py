@@ -1,11 +1,11 @@
-r"""Records demonstrations of acrobot_swingup by a controller that plans.
+r"""Records demonstrations of acrobot_swingup by planning, without learning.
 
     python launch/experts/acrobot.py --output=acrobot_swingup.npz --num_episodes=50
 
-No learning: a swing-up law with eight gains, and a linear-quadratic regulator near the
-top. No gains serve all starts, so each episode samples thousands, predicts the return
-of each with the equations of motion, takes the best, and searches again every second of
-simulated time until the arm stands. One core needs some six seconds per episode.
+A swing-up law with eight gains, and a linear-quadratic regulator near the top. No gains
+work from all initial states, so each episode samples thousands, predicts their returns
+with the equations of motion and uses the best; it repeats the search every second of
+simulated time until the arm stands. An episode takes about six seconds of one core.
 """
 
 from typing import Any, NamedTuple
@@ -15,29 +15,29 @@ import studio
 from acrobot_model import Arm, task_reward
 
 _SEARCH_EVERY_STEPS = 50
-_STANDS = 0.9  # predicted share of the greatest return from which nothing is searched
+_STANDS = 0.9  # share of the highest possible return, predicted, that ends the search
 _ELITE = 10  # gains that are varied in each round
-_VARIATION = 0.2  # relative, standard deviation
-# Smallest and largest of each gain; those of one sign are sampled log-uniformly.
+_VARIATION = 0.2  # relative standard deviation
+# Range of each gain; positive ones are sampled log-uniformly.
 GAINS = {
-    "pump": (0.5, 4.0),  # torque per joule that is missing
-    "pump_speed": (0.2, 5.0),  # seconds: how soon the elbow's speed counts as full
+    "pump": (0.5, 4.0),  # torque per missing joule
+    "pump_speed": (0.2, 5.0),  # seconds: how soon the elbow's speed saturates
     "bend": (-2.5, 2.5),  # radians: how the elbow follows the shoulder's speed
     "bend_speed": (0.1, 2.0),  # seconds
     "sway": (-1.2, 1.2),  # radians: how the elbow follows the shoulder's angle
     "stiffness": (0.3, 3.0),  # torque per radian
-    "catch_angle": (0.3, 1.0),  # radians: where the regulator may take over, ...
-    "catch_torque": (2.5, 30.0),  # ... asking at most for this many times the greatest
+    "catch_angle": (0.3, 1.0),  # radians within which the regulator may take over
+    "catch_torque": (2.5, 30.0),  # most it may then ask for, relative to the maximum
 }
 
 
 class Effort(NamedTuple):
-    """How much one search tries."""
+    """The size of one search."""
 
     draws: int  # new gains, in the first round
     variations: int  # of the best gains so far, in each round
     rounds: int  # at least 1
-    exact: int  # the best of a round by a quick prediction, which are predicted again
+    exact: int  # gains per round whose return is predicted exactly
 
 
 FIRST = Effort(draws=24_000, variations=3000, rounds=3, exact=120)
@@ -45,13 +45,7 @@ LATER = Effort(draws=4000, variations=1500, rounds=1, exact=60)
 
 
 def record(num_episodes: int, *, first: Effort = FIRST, later: Effort = LATER) -> Any:
-    """Returns K episodes as `StateDemonstrations`.
-
-    Args:
-      num_episodes: K.
-      first: effort of the search at an episode's start.
-      later: effort of the searches after it.
-    """
+    """Returns `StateDemonstrations`, by searches at an episode's start and later."""
 
     def prepare(environment: Any) -> Any:
         arm = Arm(environment.physics)
@@ -63,7 +57,7 @@ def record(num_episodes: int, *, first: Effort = FIRST, later: Effort = LATER) -
         num_episodes,
         "planning with the simulator's equations, no learning: energy swing-up "
         "and linear-quadratic regulator, eight gains searched for each episode "
-        f"(at its start {first.draws} drawn, {first.variations} varied in each "
+        f"(at its start {first.draws} sampled, {first.variations} varied in each "
         f"of {first.rounds} rounds; then every {_SEARCH_EVERY_STEPS} decisions "
         f"until it stands {later.draws}, {later.variations}, {later.rounds})",
     )
@@ -77,7 +71,7 @@ def _controller(
 
     def decide(step: int, observation: np.ndarray) -> np.ndarray:
         nonlocal gains, stands
-        del observation  # the planner needs the angles themselves
+        del observation  # lacks the angles themselves
         now = environment.simulator_state()
         state = np.concatenate([now["qpos"], now["qvel"]])
         if step % _SEARCH_EVERY_STEPS == 0 and not stands:
@@ -91,13 +85,13 @@ def _controller(
 
 
 def control(arm: Arm, state: tuple, gains: np.ndarray) -> np.ndarray:
-    """Returns actions [N] in [-1, 1], by gains [8, N] in the order of `GAINS`.
+    """Returns actions [N] in [-1, 1] for gains [8, N] in the order of `GAINS`.
 
-    Far from the top the elbow's torque adds the missing energy, and bends the elbow
-    after the shoulder's movement; near it the regulator takes over.
+    Far from the top, torque adds the missing energy, and bends the elbow to follow the
+    shoulder's motion; near the top the regulator takes over.
 
-    Source: Spong 1995, "The swing up control problem for the acrobot", for the energy
-    and the arctangent; sway and the limits of the catch are ours.
+    Source: Spong 1995, "The swing up control problem for the acrobot", for energy and
+    arctangent; sway and catch limits are our additions.
     """
     pump, pump_speed, bend, bend_speed, sway, stiffness, angle, torque = gains
     turn = 2 * float(np.pi)
@@ -116,15 +110,10 @@ def control(arm: Arm, state: tuple, gains: np.ndarray) -> np.ndarray:
 def predict(
     arm: Arm, state: np.ndarray, gains: np.ndarray, num_steps: int, *, exact: bool
 ) -> np.ndarray:
-    """Returns the return [N] of each column of gains [8, N] from one state [4].
+    """Returns the return [N] of gains [8, N] from one state [4].
 
-    Args:
-      arm: the model.
-      state: where all start.
-      gains: see `control`.
-      num_steps: agent steps that are left.
-      exact: as the environment would, with actions rounded to float32; else in float32
-        with one time step per agent step, four times as fast.
+    With `exact` as in the environment; else four times as fast, in float32 with one
+    time step per agent step.
     """
     dtype = np.float64 if exact else np.float32
     gains = gains.astype(dtype)
@@ -147,9 +136,9 @@ def search(
     effort: Effort,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, float]:
-    """Returns the best gains found, [8], and their predicted return.
+    """Returns the best gains [8] and their predicted return.
 
-    `held` are gains in use, which only better ones replace, [8]; others as `predict`.
+    They are at least as good as the gains in use, `held`, [8].
     """
     best = np.zeros((len(GAINS), 0)) if held is None else held[:, None]
     returns = np.zeros(0)
@@ -159,7 +148,7 @@ def search(
             parents = best[:, rng.integers(best.shape[1], size=effort.variations)]
             varied = parents * np.exp(_VARIATION * rng.normal(size=parents.shape))
             tried = np.append(tried, varied, axis=1)
-        # The motion magnifies rounding, so the quick prediction only sorts out.
+        # The motion is chaotic, so the fast prediction only preselects.
         rough = predict(arm, state, tried, num_steps, exact=False)
         best = np.append(best, tried[:, np.argsort(-rough)[: effort.exact]], axis=1)
         returns = predict(arm, state, best, num_steps, exact=True)

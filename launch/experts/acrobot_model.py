@@ -7,15 +7,14 @@ from studio import ACTION_REPEAT
 
 
 class Arm:
-    """The simulated arm, in closed form, for many states at once.
+    """A closed-form model of the arm, for many states at once.
 
-    A state is (shoulder, elbow, and their speeds), in radians and radians per second,
-    both angles 0 when upright: four arrays [N]. float32 states give a quick prediction,
-    float64 the simulator's to rounding.
+    A state is four arrays [N]: angles of shoulder and elbow in radians, 0 when upright,
+    and their speeds. In float64 it matches the simulator to rounding.
     """
 
     def __init__(self, physics: Any):
-        """Reads lengths, masses and so on from a dm_control `Physics`."""
+        """Reads the parameters of a dm_control `Physics`."""
         model = physics.model
         mass_1, mass_2 = model.body_mass[1:]
         centre_1, centre_2 = model.body_ipos[1:, 2]
@@ -24,7 +23,7 @@ class Arm:
         gravity = -model.opt.gravity[2]
         far = inertia_2 + mass_2 * centre_2**2
         near = inertia_1 + mass_1 * centre_1**2 + mass_2 * length**2
-        # Python's floats, because NumPy's own would make float32 arrays float64.
+        # Python floats: NumPy's would promote float32 arrays to float64.
         self._inertia, self._far = float(near + far), float(far)
         self._coupling = float(mass_2 * length * centre_2)
         self._weight_1 = float(gravity * (mass_1 * centre_1 + mass_2 * length))
@@ -44,9 +43,9 @@ class Arm:
         return kinetic + self._weight_1 * np.cos(q1) + self._weight_2 * np.cos(q1 + q2)
 
     def step(self, state: tuple, action: np.ndarray, num_frames: int = 1) -> tuple:
-        """Returns the state after so many frames, as one Runge-Kutta step of order 4.
+        """Returns the state after one Runge-Kutta step (order 4) over `num_frames`.
 
-        Actions [N] lie in [-1, 1]; one frame is what the simulator does.
+        Actions [N] are in [-1, 1]. The simulator takes one step per frame.
         """
         q1, q2, v1, v2 = state
         torque, h = self._gear * action, self._frame_seconds * num_frames
@@ -80,7 +79,7 @@ class Arm:
         )
 
     def _regulator(self) -> np.ndarray:
-        """Returns K of action = -K state, optimal about the top. Shape [4]."""
+        """Returns K of the optimal action = -K state near the top. Shape [4]."""
         small = 1e-5
         nudges = small * np.concatenate([np.eye(5), -np.eye(5)])
         state = tuple(nudges.T[:4])
@@ -91,7 +90,7 @@ class Arm:
         a, b = slopes[:, :4], slopes[:, 4:]
         cost = to_go = np.diag([1.0, 1.0, 0.1, 0.1])
         gain = np.zeros((1, 4))
-        for _ in range(2000):  # Riccati's recursion, long past convergence
+        for _ in range(2000):  # Riccati recursion, converged
             gain = np.linalg.solve(1 + b.T @ to_go @ b, b.T @ to_go @ a)
             to_go = cost + a.T @ to_go @ (a - b @ gain)
         return gain[0]
@@ -100,7 +99,7 @@ class Arm:
 def task_reward(q1: np.ndarray, q2: np.ndarray) -> np.ndarray:
     """Returns the suite's reward of one frame, in [0, 1]. Shape [N].
 
-    The tip should be within 0.2 m of its highest place; 1 m further off gives 0.1.
+    It is 1 within 0.2 m of the tip's highest point, and 0.1 at 1 m from there on.
     """
     x = np.sin(q1) + np.sin(q1 + q2)
     z = np.cos(q1) + np.cos(q1 + q2) - 2

@@ -1,12 +1,12 @@
-r"""Records demonstrations of cheetah_run by a learned policy that thinks ahead.
+r"""Records demonstrations of cheetah_run by a learned policy with planning.
 
     python -m jaxil.launch --config=configs/expert.py:cheetah_run --workdir=runs/cheetah
     python launch/experts/cheetah.py --workdir=runs/cheetah --output=cheetah_run.npz
 
-Policies on state vectors stop near three quarters of the greatest speed for millions of
-frames. So each decision starts from what the policy would do for ten more, tries 768
-other sequences in the simulator, adds the critic's value of each final state, and takes
-the best one's first action. One core needs some 40 seconds per episode.
+Policies on state vectors stay near three quarters of full speed for millions of frames.
+So each decision varies the policy's next ten actions, simulates 768 sequences, adds the
+critic's value of each final state, and takes the first action of the best sequence. An
+episode takes about 40 seconds of one core.
 """
 
 import pathlib
@@ -22,16 +22,7 @@ TASK = "cheetah_run"
 def record(
     folder: pathlib.Path, num_episodes: int, effort: Effort | None = None
 ) -> Any:
-    """Returns K episodes as `StateDemonstrations`.
-
-    Args:
-      folder: of a run on the task's state vectors; its newest checkpoint is taken.
-      num_episodes: K.
-      effort: of the search at each decision.
-
-    Raises:
-      UsageError: there is no such run.
-    """
+    """Returns `StateDemonstrations` of a run on state vectors, improved by search."""
     effort = effort or Effort()
     judge, discount, about = _load_judge(folder)
 
@@ -64,7 +55,7 @@ def record(
 
 
 def _load_judge(folder: pathlib.Path) -> tuple[Judge, float, str]:
-    """Returns policy and values of a run, its discount factor, and its description."""
+    """Returns a run's policy and values, its discount factor and its description."""
     import jax
     import jax.numpy as jnp
 
@@ -76,8 +67,8 @@ def _load_judge(folder: pathlib.Path) -> tuple[Judge, float, str]:
     for field, wanted in (("task", TASK), ("observation", "state")):
         if config[field] != wanted:
             raise UsageError(
-                f"--workdir={folder} is a run with {field}={config[field]!r}, where "
-                f"{wanted!r} is needed; name one of configs/expert.py:{TASK}"
+                f"--workdir={folder} is a run with {field}={config[field]!r}, not "
+                f"{wanted!r}; name a run of configs/expert.py:{TASK}"
             )
     run = trained.load(folder)
     encoder, actor, critic = run.params

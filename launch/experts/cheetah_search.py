@@ -1,4 +1,4 @@
-"""Searches for actions in the simulator, guided by a learned policy and its values."""
+"""Plans actions in the simulator, guided by a learned policy and its values."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -8,7 +8,7 @@ import numpy as np
 from mujoco import rollout
 from studio import ACTION_REPEAT
 
-_FULL_SPEED = 10.0  # m/s, from which the task pays 1 a frame
+_FULL_SPEED = 10.0  # m/s, at which the reward reaches 1 per frame
 _STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 # Observations [B, S] -> actions [B, A] and the values [B] of taking them.
@@ -16,21 +16,21 @@ Judge = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class Effort(NamedTuple):
-    """How much is tried for one decision."""
+    """The size of the search for one decision."""
 
-    horizon: int = 10  # H, decisions that are simulated
+    horizon: int = 10  # H, simulated agent steps
     candidates: int = 64  # N, sequences of H actions in each round
-    rounds: int = 12  # of sampling around the best sequences of the round before
+    rounds: int = 12
     spread: float = 0.4  # standard deviation in the first round
-    elites: int = 8  # sequences that the next round is sampled around
+    elites: int = 8  # best sequences, around which the next round samples
     temperature: float = 0.1  # of their weights, in units of return
 
 
 class Simulator:
-    """MuJoCo itself, run from any state without touching the environment."""
+    """Simulates from any state without changing the environment."""
 
     def __init__(self, physics: Any) -> None:
-        """Prepares to simulate the model of a dm_control `Physics`."""
+        """Takes the model of a dm_control `Physics`."""
         self._model, self._live = physics.model.ptr, physics.data.ptr
         self._data = mujoco.MjData(self._model)
         sensor = self._model.sensor("torso_subtreelinvel")
@@ -40,7 +40,7 @@ class Simulator:
         self._velocities = slice(start, start + self._model.nv)
 
     def now(self) -> np.ndarray:
-        """Returns the environment's present state, shape [P]."""
+        """Returns the environment's current state, shape [P]."""
         state = np.empty(mujoco.mj_stateSize(self._model, _STATE))
         mujoco.mj_getState(self._model, self._live, state, _STATE)
         return state
@@ -48,11 +48,11 @@ class Simulator:
     def run(
         self, state: np.ndarray, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Tries sequences of actions [N, H, A] in [-1, 1] from one state [P].
+        """Simulates sequences of actions [N, H, A] in [-1, 1] from one state [P].
 
         Returns:
-          States after each decision [N, H, P], and rewards [N, H]: a step's speed is
-          that of the state it starts from, one frame before the task's own.
+          States [N, H, P] and rewards [N, H] after each agent step. Rewards are of the
+          speed one frame before the task's.
         """
         count, horizon, _ = actions.shape
         controls = np.repeat(actions, ACTION_REPEAT, axis=1).astype(np.float64)
@@ -63,20 +63,13 @@ class Simulator:
         return states[:, ACTION_REPEAT - 1 :: ACTION_REPEAT], rewards
 
     def observe(self, states: np.ndarray) -> np.ndarray:
-        """Returns what the suite observes of states, [..., P] to float32 [..., S]."""
+        """Returns the suite's observations float32 [..., S] of states [..., P]."""
         parts = states[..., self._positions], states[..., self._velocities]
         return np.concatenate(parts, axis=-1).astype(np.float32)
 
 
 class Planner(NamedTuple):
-    """Improves on a policy by trying sequences of actions.
-
-    Attributes:
-      simulator: what they are tried in.
-      judge: policy and values.
-      discount: gamma.
-      effort: how much is tried.
-    """
+    """Improves on a policy by simulating sequences of actions."""
 
     simulator: Simulator
     judge: Judge
@@ -84,7 +77,7 @@ class Planner(NamedTuple):
     effort: Effort
 
     def follow(self, state: np.ndarray) -> np.ndarray:
-        """Returns what the policy would do from a state on, shape [H, A]."""
+        """Returns the policy's next actions, shape [H, A]."""
         actions = []
         for _ in range(self.effort.horizon):
             action = self.judge(self.simulator.observe(state)[None])[0]
@@ -105,11 +98,11 @@ class Planner(NamedTuple):
     def search(
         self, state: np.ndarray, plan: np.ndarray | None, rng: np.random.Generator
     ) -> np.ndarray:
-        """Returns a sequence of actions [H, A] that is better than the policy's.
+        """Returns a sequence of actions [H, A] at least as good as the policy's.
 
-        The cross-entropy method, weighted as in MPPI: each round samples around the
-        weighted mean of the round before; the policy's own sequence is always a
-        candidate. `plan` is the last decision's result; None at an episode's start.
+        The cross-entropy method with MPPI's weights: each round samples around the
+        weighted mean of the last; the policy's sequence is always a candidate. `plan`
+        is the last decision's result; None at an episode's start.
         """
         effort = self.effort
         usual = self.follow(state)

@@ -1,4 +1,4 @@
-"""What the controllers share: flags, playing, and the resulting file."""
+"""What the experts share: flags, recording, and the output file."""
 
 import argparse
 import pathlib
@@ -13,19 +13,18 @@ from jaxil.demonstrations import playing, states
 from jaxil.environments import suite
 from jaxil.machine import startup
 
-SEED = 777  # the resets', as in `jaxil.collect`
+SEED = 777  # as in `jaxil.collect`
 ACTION_REPEAT = 2
 _MAX_EPISODES = 10_000
 
-# Environment -> episode -> its controller, whose randomness may depend on the episode's
-# number alone.
+# Environment -> episode number, the only source of randomness -> controller.
 Prepare = Callable[[Any], Callable[[int], playing.Decide]]
 
 
 def record(
     task: str, prepare: Prepare, num_episodes: int, expert: str
 ) -> states.StateDemonstrations:
-    """Plays episodes; progress goes to stderr. `expert` says how they are made."""
+    """Records episodes. `expert` describes how they are made."""
     began, began_cpu = time.monotonic(), time.process_time()
 
     def finished(episode: int, task_return: float) -> None:
@@ -54,7 +53,7 @@ def record(
 
 
 class Parser(argparse.ArgumentParser):
-    """Flags of a controller: --output and --num_episodes, and what it adds."""
+    """The flags that all experts have."""
 
     def __init__(self, description: str | None) -> None:
         form = argparse.RawDescriptionHelpFormatter
@@ -67,17 +66,12 @@ class Parser(argparse.ArgumentParser):
         )
 
     def error(self, message: str) -> NoReturn:
-        """Ends the command with one sentence instead of the usage."""
+        """Exits with one sentence, without printing the usage."""
         self.exit(2, f"{message}; --help lists the flags\n")
 
 
 def run(parser: Parser, make: Callable[[Any], states.StateDemonstrations]) -> None:
-    """Runs a controller's command.
-
-    Args:
-      parser: of its flags.
-      make: records demonstrations, given the flags' values.
-    """
+    """Runs an expert's command; `make` records, given the values of the flags."""
     values = parser.parse_args()
     print(startup.prepare(), file=sys.stderr, flush=True)
     try:

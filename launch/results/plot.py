@@ -12,7 +12,7 @@ import pathlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from jaxil.files.metrics import read_csv
+from jaxil.files.tables import read_csv
 
 _HERE = pathlib.Path(__file__).parent
 _EPISODE_FRAMES = 1000

@@ -1,51 +1,61 @@
-"""Where the runs of a sweep are done: this machine, this process, or Slurm."""
+"""Where the runs of a sweep are done: this machine, or Slurm.
 
-import contextlib
-import dataclasses
+A Slurm job resumes where it was cut off; the jobs of a sweep make an array.
+"""
+
+import getpass
 import glob
 import importlib.util
 import os
 import pathlib
+import shlex
+import shutil
 import signal
+import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
-from jaxil.config import unknown_name
+from jaxil.errors import Fault, unknown_name
 from jaxil.machine import devices
-from launch.sweeps import plan, slurm, state
-from launch.sweeps.process import Process
-from launch.sweeps.worker import Place, Worker
+from launch.sweeps import state
+from launch.sweeps.state import Run
+from launch.sweeps.worker import Place, Worker, python_path
 
 CLUSTERS = ("local", "slurm", "debug")
-_POLL_SECONDS = 1.0
-_A_YEAR_MINUTES = 365 * 24 * 60  # submitit must be told some limit
+_POLL_SECONDS = 0.5
 _JAX_MEMORY = 0.9  # of a GPU that several runs share
+# Slurm's default MaxArraySize allows no larger index.
+_ARRAY_SIZE = 1000
+_REQUEUES = 1000  # on timeouts: a run is worth resuming until it is done
+# How long before the time limit a run is asked to save: a checkpoint takes seconds,
+# a decision that waits for a compilation a minute.
+_SAVING_SECONDS = 120
+_ANSWER_SECONDS = 60
+_PATIENCE_SECONDS = 300.0  # file locks of a node that broke down last a while
+# After SIGTERM, Slurm either kills the job or lets submitit requeue it.
+_VERDICT_SECONDS = 600.0
 
 
-@dataclasses.dataclass(frozen=True)
-class Cluster:
-    """Where to run, unchecked.
-
-    Attributes:
-      name: one of `CLUSTERS`.
-      num_workers: runs at a time, on this machine; None for as many as fit.
-      hours: time limit of a Slurm job, after which it is queued again.
-      partition: of Slurm; "" for its default.
-      num_gpus: of a Slurm job.
-      num_cpus: of a Slurm job.
-    """
+class Cluster(NamedTuple):
+    """Where to run, unchecked."""
 
     name: str
-    num_workers: int | None = None
-    hours: float = 24.0
-    partition: str = ""
-    num_gpus: int = 1
-    num_cpus: int = 4
+    num_workers: int | None = None  # runs at a time here; None for as many as fit
+    hours: float = 24.0  # time limit of a Slurm job, which is then queued again
+    partition: str = ""  # of Slurm; "" for its default
+    num_gpus: int = 1  # of a Slurm job
+    num_cpus: int = 4  # of a Slurm job
+
+    @property
+    def uses_gpus(self) -> bool:
+        """Whether runs will compute on GPUs, told without starting jax."""
+        return self.num_gpus > 0 if self.name == "slurm" else not devices.uses_cpu()
 
 
-def problems(cluster: Cluster, *, starts: bool) -> Iterator[str]:
-    """Yields one sentence for each reason why a cluster can't be used.
+def problems(cluster: Cluster, *, starts: bool) -> Iterator[Fault]:
+    """Yields each reason why a cluster is not available.
 
     Args:
       cluster: unchecked.
@@ -53,52 +63,41 @@ def problems(cluster: Cluster, *, starts: bool) -> Iterator[str]:
     """
     if cluster.name not in CLUSTERS:
         yield unknown_name("--cluster", cluster.name, CLUSTERS)
-    has_submitit = importlib.util.find_spec("submitit") is not None
-    if starts and cluster.name in ("local", "slurm") and not has_submitit:
-        yield (
-            f"--cluster={cluster.name!r} starts jobs with submitit, which is not "
-            "installed: pip install 'jaxil[cluster]', or use --cluster=debug"
-        )
-    if starts and cluster.name == "slurm" and (fault := slurm.fault()):
-        yield (
-            f"--cluster='slurm': no Slurm here: {fault}; run this on a login node of "
-            "your cluster, or use --cluster=local"
-        )
+    if starts and cluster.name == "slurm":
+        if importlib.util.find_spec("submitit") is None:
+            rule = "starts jobs with submitit, which is not installed"
+            way_out = "pip install 'jaxil[cluster]', or use --cluster=local"
+            yield Fault("--cluster", rule, way_out, "slurm")
+        if fault := _slurm_fault():
+            way_out = "run this on a login node of your cluster, or use --cluster=local"
+            yield Fault("--cluster", f"finds no Slurm here: {fault}", way_out, "slurm")
     most = len(os.sched_getaffinity(0))
     if cluster.num_workers is not None and not 1 <= cluster.num_workers <= most:
-        yield (
-            f"--workers={cluster.num_workers} must lie in [1, {most}]: a run needs a "
-            f"core, and this machine has {most}"
-        )
+        rule = f"must lie in [1, {most}]: a run needs a core, and there are {most}"
+        yield Fault("--workers", rule, value=cluster.num_workers)
     if not 0.0 < cluster.hours <= 10_000.0:
-        yield f"--hours={cluster.hours} must lie in (0, 10000]: a Slurm job's limit"
+        rule = "must lie in (0, 10000]: the time limit of a Slurm job"
+        yield Fault("--hours", rule, value=cluster.hours)
     if cluster.num_gpus not in (0, 1):
-        yield f"--gpus={cluster.num_gpus} must be 0 or 1: a run uses one device"
+        rule = "must be 0 or 1: a run uses one device"
+        yield Fault("--gpus", rule, value=cluster.num_gpus)
     if not 1 <= cluster.num_cpus <= 1024:
-        yield f"--cpus={cluster.num_cpus} must lie in [1, 1024]: cores of a Slurm job"
-
-
-def uses_gpus(cluster: Cluster) -> bool:
-    """Returns whether runs will compute on GPUs, told without starting jax."""
-    if cluster.name == "slurm":
-        return cluster.num_gpus > 0
-    return not devices.uses_cpu()
+        rule = "must lie in [1, 1024]: cores of a Slurm job"
+        yield Fault("--cpus", rule, value=cluster.num_cpus)
 
 
 def num_at_once(cluster: Cluster, num_runs: int) -> int:
     """Returns how many runs go on at a time, at most."""
-    if cluster.name == "slurm":
-        return num_runs
-    return len(places(cluster, num_runs))
+    return num_runs if cluster.name == "slurm" else len(places(cluster, num_runs))
 
 
 def places(cluster: Cluster, num_runs: int) -> list[Place]:
-    """Returns a share of this machine for each local worker."""
-    cores = sorted(os.sched_getaffinity(0))
-    gpus = _gpus()
+    """Returns a share of this machine for each worker."""
     if cluster.name == "debug":
         return [Place()]
-    fitting = 1 if uses_gpus(cluster) else len(cores)
+    cores = sorted(os.sched_getaffinity(0))
+    gpus = _gpus()
+    fitting = 1 if cluster.uses_gpus else len(cores)
     number = min(cluster.num_workers or len(gpus) or fitting, num_runs)
     share = len(cores) // max(number, 1)
     made = []
@@ -107,17 +106,15 @@ def places(cluster: Cluster, num_runs: int) -> list[Place]:
         if gpus:
             environment.append(("CUDA_VISIBLE_DEVICES", gpus[i % len(gpus)]))
         if gpus and number > len(gpus):
-            runs_per_gpu = -(-number // len(gpus))
-            fraction = f"{_JAX_MEMORY / runs_per_gpu:.2f}"
-            environment.append(("XLA_PYTHON_CLIENT_MEM_FRACTION", fraction))
-        own = tuple(cores[i * share : (i + 1) * share])
-        made.append(Place(cores=own, environment=tuple(environment)))
+            fraction = _JAX_MEMORY / -(-number // len(gpus))
+            environment.append(("XLA_PYTHON_CLIENT_MEM_FRACTION", f"{fraction:.2f}"))
+        made.append(Place(tuple(cores[i * share : (i + 1) * share]), (*environment,)))
     return made
 
 
 def start(
     cluster: Cluster,
-    runs: Sequence[plan.Run],
+    runs: Sequence[Run],
     folder: pathlib.Path,
     watch: Callable[[], None],
 ) -> None:
@@ -134,58 +131,114 @@ def start(
     """
     for run in runs:
         state.forget_failure(run)
-    logs = folder / ".sweep"
-    here = pathlib.Path.cwd()
-    if cluster.name == "debug":
-        # submitit's own executor of this name would open a debugger.
-        Worker(list(runs), Place(), folder=here)()
+    if cluster.name == "slurm":
+        submit(cluster, runs, folder / ".sweep")
         return
-    with _importable():
-        if cluster.name == "slurm":
-            slurm.submit(
-                runs,
-                logs=logs,
-                folder=here,
-                hours=cluster.hours,
-                partition=cluster.partition,
-                num_gpus=cluster.num_gpus,
-                num_cpus=cluster.num_cpus,
-            )
-        else:
-            workers = [
-                Worker(list(runs), place, folder=here, leader=Process.current())
-                for place in places(cluster, len(runs))
-            ]
-            _lead(workers, logs, watch)
+    here = pathlib.Path.cwd()
+    shares = places(cluster, len(runs))
+    workers = [Worker(runs, place, folder=here) for place in shares]
+    for worker in workers:
+        # Daemons, so that another Ctrl-C ends the sweep; its runs then still save.
+        threading.Thread(target=worker.work, daemon=True).start()
 
+    def wait(watch: Callable[[], None]) -> None:
+        # Not Thread.join, which an exception makes believe that the thread has ended.
+        while not all(worker.has_ended for worker in workers):
+            watch()
+            time.sleep(_POLL_SECONDS)
 
-def _lead(workers: list[Worker], logs: pathlib.Path, watch: Callable[[], None]) -> None:
-    """Starts local workers and stays with them."""
-    import submitit
-
-    executor = submitit.LocalExecutor(logs)
-    executor.update_parameters(timeout_min=_A_YEAR_MINUTES)
-    # The workers inherit this: Ctrl-C reaches them through this process only, since
-    # submitit answers it with SIGKILL.
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        jobs = [executor.submit(worker) for worker in workers]
-    finally:
-        signal.signal(signal.SIGINT, before)
-    try:
-        _wait(jobs, watch)
+        wait(watch)
     except KeyboardInterrupt:
-        for job in jobs:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(int(job.job_id), signal.SIGTERM)  # passed on to the worker
-        _wait(jobs, lambda: None)
+        for worker in workers:
+            worker.must_stop = True
+        wait(lambda: None)
         raise
 
 
-def _wait(jobs: Sequence[Any], watch: Callable[[], None]) -> None:
-    while not all(job.done() for job in jobs):
-        watch()
-        time.sleep(_POLL_SECONDS)
+class Job(Worker):
+    """One Slurm job: a pickled instance is what submitit calls on the node."""
+
+    # Slurm may send its signals to the run as well, or only to this process: it
+    # depends on the cluster. By then the run has met its own, and ignores SIGHUP.
+    pause_seconds = 3.0
+
+    def __call__(self) -> None:
+        """Does its run; requeues it when Slurm warns of an end."""
+        from submitit.core.job_environment import JobEnvironment
+
+        requeue_signal = JobEnvironment._usr_sig()
+        self._signal = 0
+        requeue: Any = signal.signal(requeue_signal, self._note)
+        signal.signal(signal.SIGTERM, self._note)
+        self.work()
+        end = time.monotonic() + _VERDICT_SECONDS
+        while self._signal == signal.SIGTERM and time.monotonic() < end:
+            time.sleep(_POLL_SECONDS)
+        if self._signal == requeue_signal:
+            requeue(self._signal, None)
+
+    def checkpoint(self) -> Any:
+        """Returns the job that resumes this one; submitit asks for it."""
+        from submitit.helpers import DelayedSubmission
+
+        self.must_stop = False
+        return DelayedSubmission(self)
+
+    def _note(self, number: int, frame: Any) -> None:
+        del frame
+        self.must_stop = True
+        # A request to requeue outweighs SIGTERM, which comes along with it.
+        if self._signal in (0, signal.SIGTERM):
+            self._signal = number
+
+
+def submit(cluster: Cluster, runs: Sequence[Run], logs: pathlib.Path) -> None:
+    """Queues one job for each run; a site's further needs go in SBATCH_... variables.
+
+    Args:
+      cluster: checked.
+      runs: at least one; their commands are seen from the current folder.
+      logs: folder of what submitit writes; all nodes must see it.
+    """
+    import submitit
+
+    minutes = max(round(cluster.hours * 60), 1)
+    executor = submitit.SlurmExecutor(logs, max_num_timeout=_REQUEUES)
+    executor.update_parameters(
+        job_name="jaxil",
+        time=minutes,
+        cpus_per_task=cluster.num_cpus,
+        # srun no longer takes it over from sbatch.
+        srun_args=[f"--cpus-per-task={cluster.num_cpus}"],
+        signal_delay_s=min(_SAVING_SECONDS, 15 * minutes),
+        setup=[f"export PYTHONPATH={shlex.quote(python_path())}"],
+        additional_parameters={"requeue": True},
+        **({"partition": cluster.partition} if cluster.partition else {}),
+        **({"gpus_per_node": cluster.num_gpus} if cluster.num_gpus else {}),
+    )
+    here = pathlib.Path.cwd()
+    for first in range(0, len(runs), _ARRAY_SIZE):
+        some = runs[first : first + _ARRAY_SIZE]
+        made = [
+            Job([run], Place(), folder=here, patience_seconds=_PATIENCE_SECONDS)
+            for run in some
+        ]
+        for run, job in zip(some, executor.submit_array(made), strict=True):
+            state.note_slurm_job(run, job.job_id)
+
+
+def queued_jobs(runs: Sequence[Run]) -> frozenset[str]:
+    """Returns which Slurm jobs of this user wait or run; none if no run has one."""
+    has_jobs = any(os.path.exists(run.folder / "slurm_job") for run in runs)
+    if not has_jobs or shutil.which("squeue") is None:
+        return frozenset()
+    user = f"--user={getpass.getuser()}"
+    try:
+        listed = _output("squeue", "--noheader", "--array", "--format=%i", user)
+    except (subprocess.SubprocessError, OSError):
+        return frozenset()  # without it a run may be queued twice, but not done twice
+    return frozenset(listed.split())
 
 
 def _gpus() -> list[str]:
@@ -198,16 +251,21 @@ def _gpus() -> list[str]:
     return [str(i) for i in range(len(glob.glob("/dev/nvidia[0-9]*")) or 1)]
 
 
-@contextlib.contextmanager
-def _importable() -> Iterator[None]:
-    """Lets the jobs' processes find this package, wherever they are started."""
-    before = os.environ.get("PYTHONPATH")
-    parts = [str(plan.ROOT), *([before] if before else [])]
-    os.environ["PYTHONPATH"] = os.pathsep.join(parts)
+def _slurm_fault() -> str | None:
+    """Returns why no job can be queued from here; None if one can."""
+    if shutil.which("sbatch") is None:
+        return "there is no command sbatch"
     try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["PYTHONPATH"]
-        else:
-            os.environ["PYTHONPATH"] = before
+        _output("sinfo", "--noheader")
+    except subprocess.CalledProcessError as error:
+        said = error.stderr.strip().splitlines()
+        return f"sinfo fails ({said[-1] if said else error.returncode})"
+    except (subprocess.SubprocessError, OSError) as error:
+        return f"sinfo fails ({error})"
+    return None
+
+
+def _output(*arguments: str) -> str:
+    return subprocess.run(
+        arguments, check=True, capture_output=True, text=True, timeout=_ANSWER_SECONDS
+    ).stdout

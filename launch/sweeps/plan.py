@@ -4,70 +4,36 @@ import dataclasses
 import os
 import pathlib
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from jaxil import command
-from jaxil.config import Config, default_config, unknown_name
+from jaxil import command, methods
+from jaxil import config as jaxil_config
+from jaxil.config import Config
+from jaxil.errors import Fault, UsageError, unknown_name
 from jaxil.reporting import figures
 from jaxil.training import workdir
-from launch.sweeps.faults import Faults, Faulty
+from launch.sweeps import state
+from launch.sweeps.state import Run
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 PRESETS = ("paper", "tiny")
 _FIGURES = {f"figure{number}": figure for number, figure in figures.FIGURES.items()}
-# What the sweep itself says about each run.
+# What the sweep itself sets in each run.
 _OWN_FLAGS = {"seed": "--seeds", "task": "--tasks", "method": "--methods"}
+_SHOWN = 3  # runs that a fault lists
 
 
-class Run(NamedTuple):
-    """One run, as the worker that trains it has to know it.
-
-    Attributes:
-      task: a dm_control `domain_task`.
-      slug: of the variant.
-      method: of the variant.
-      seed: >= 0.
-      folder: where it lives, DIR/TASK/SLUG/seedN.
-      total_frames: its budget, in environment frames.
-      command: the command line that trains it, or goes on with it.
-    """
-
-    task: str
-    slug: str
-    method: str
-    seed: int
-    folder: pathlib.Path
-    total_frames: int
-    command: tuple[str, ...]
-
-    @property
-    def name(self) -> str:
-        """What messages call it."""
-        return f"{self.task}/{self.slug}/seed{self.seed}"
-
-
-@dataclasses.dataclass(frozen=True)
-class Request:
-    """What the user asked for, unchecked.
-
-    Attributes:
-      methods: plain variants.
-      ablations: such as "figure7".
-      tasks: dm_control `domain_task`s.
-      num_seeds: seeds 0, 1, ... of each.
-      preset: one of `PRESETS`.
-      folder: of the sweep.
-      overrides: words "--config.FIELD=VALUE", for all runs.
-    """
+class Request(NamedTuple):
+    """What the user asked for, unchecked."""
 
     methods: Sequence[str]
-    ablations: Sequence[str]
+    ablations: Sequence[str]  # such as "figure7"
     tasks: Sequence[str]
     num_seeds: int
     preset: str
-    folder: pathlib.Path
-    overrides: Sequence[str]
+    folder: pathlib.Path  # of the sweep
+    overrides: Mapping[str, str]  # of config fields, in all runs that have the field
 
 
 class _Choice(NamedTuple):
@@ -76,7 +42,7 @@ class _Choice(NamedTuple):
 
 
 def make_runs(
-    request: Request, config_problems: Callable[[Config], list[str]]
+    request: Request, config_problems: Callable[[Config], Sequence[Fault]]
 ) -> list[Run]:
     """Returns all runs: seed 0 of everything first, so that early results compare.
 
@@ -85,84 +51,86 @@ def make_runs(
       config_problems: as `jaxil.training.assembly.problems`.
 
     Raises:
-      Faulty: names every fault of every run, each once.
+      UsageError: names every fault of every run, each once.
     """
-    faults = Faults()
-    for sentence in _request_problems(request):
-        faults.add(sentence)
-    # Without any method, one stands in, so that faults of tasks are told as well.
+    # Without any method, one stands in, so that faults of tasks are found as well.
     choices = _choices(request) or [_Choice(figures.Variant("drqv2"), False)]
-    runs: list[list[Run]] = []
-    groups = [(task, choice) for task in request.tasks for choice in choices]
-    for task, choice in groups:
-        where = f"{task}/{choice.variant.slug}"
-        config, words = _configured(request, task, choice, faults, where)
-        if config is None:
-            continue
-        for sentence in config_problems(config):
-            faults.add(sentence, where)
-        runs.append(list(_seeds(request, config, words)))
-    for group in runs if not faults else []:
-        _check_folders(group, request.folder, faults)
-    if faults:
-        everywhere = {f"{task}/{choice.variant.slug}" for task, choice in groups}
-        raise Faulty(faults.sentences(everywhere))
-    return [run for seed in zip(*runs, strict=True) for run in seed]
+    groups = {f"{t}/{c.variant.slug}": (t, c) for t in request.tasks for c in choices}
+    found = [(fault, "") for fault in _request_problems(request, choices)]
+    planned: list[tuple[Config, list[Run]]] = []
+    for where, (task, choice) in groups.items():
+        try:
+            config, words = _configured(request, task, choice)
+        except UsageError as error:
+            found += [(fault, where) for fault in error.faults]
+        else:
+            found += [(fault, where) for fault in config_problems(config)]
+            planned.append((config, list(_seeds(request, config, words))))
+    if not found:
+        found = [
+            (fault, run.name)
+            for config, runs in planned
+            for run in runs
+            for fault in _folder_problems(request.folder, run, config)
+        ]
+    if found:
+        raise UsageError(_each_once(found, everywhere=set(groups)))
+    return [run for seed in zip(*(runs for _, runs in planned)) for run in seed]
 
 
-def read_config(words: Sequence[str]) -> Config:
-    """Returns the config that `jaxil.launch` would make of a command's words.
-
-    Raises:
-      UsageError: as `jaxil.launch` would.
-    """
-    argv = ["sweep", *(word for word in words if word.startswith("--config"))]
-    return command.parse(argv, "", command.define_config).config
-
-
-def _request_problems(request: Request) -> Iterator[str]:
+def _request_problems(
+    request: Request, choices: Sequence[_Choice]
+) -> Iterator[Fault | str]:
     if not request.methods and not request.ablations:
-        yield "--methods is missing: name some, such as --methods=pdac,psil"
+        yield Fault("--methods", "is missing", "name some, such as --methods=pdac,psil")
     if request.preset not in PRESETS:
         yield unknown_name("--preset", request.preset, PRESETS)
-    known = _known_methods(request.preset)
     for method in request.methods:
-        if method not in known:
-            yield unknown_name("--methods", method, known)
+        for fault in _method_problems(method):
+            yield dataclasses.replace(fault, subject="--methods")
     for ablation in request.ablations:
         if ablation not in _FIGURES:
             yield unknown_name("--ablation", ablation, tuple(_FIGURES))
     if not request.tasks:
-        yield "--tasks is empty: name some, or leave it out for the paper's eight"
+        yield Fault("--tasks", "is empty", "leave it out for the paper's eight")
     if request.num_seeds < 1:
-        yield f"--seeds={request.num_seeds} must be at least 1: it is their number"
+        yield Fault("--seeds", "must be at least 1", value=request.num_seeds)
     if (request.folder / "config.json").exists():
-        yield (
-            f"--workdir={str(request.folder)!r} is the folder of a single run: name "
-            "another for the sweep"
+        yield Fault(
+            "--workdir",
+            "is the folder of a single run",
+            "name another for the sweep",
+            str(request.folder),
         )
     else:
-        yield from workdir.problems(request.folder, default_config())
-    for word in request.overrides:
-        field = _field(word)
-        if field in _OWN_FLAGS:
-            yield f"{word} is what the sweep itself sets: use {_OWN_FLAGS[field]}"
+        yield from workdir.problems(request.folder, jaxil_config.default_config())
+    known = {
+        field: None
+        for choice in choices
+        for field in jaxil_config.fields(choice.variant.method)
+    }
+    for field, value in request.overrides.items():
+        if any(field in choice.variant.overrides for choice in choices):
+            yield Fault(f"--config.{field}", "is what a figure varies", "leave it out")
+        elif field in _OWN_FLAGS:
+            rule, way_out = "is what the sweep itself sets", f"use {_OWN_FLAGS[field]}"
+            yield Fault(f"--config.{field}", rule, way_out, value)
+        elif field not in known:
+            yield unknown_name("field", field, tuple(known))
 
 
-def _known_methods(preset: str) -> tuple[str, ...]:
-    """Returns the methods that have a config file; one of tiny.py's serves all."""
-    return tuple(
-        method
-        for method in figures.METHOD_NAMES
-        if preset != "paper" or (ROOT / "configs" / f"{method}.py").is_file()
-    )
+def _method_problems(method: str) -> tuple[Fault, ...]:
+    try:
+        methods.get(method)
+    except UsageError as error:
+        return tuple(fault for fault in error.faults if isinstance(fault, Fault))
+    return ()
 
 
 def _choices(request: Request) -> list[_Choice]:
     """Returns the union of what methods and figures ask for, in their order."""
-    known = _known_methods(request.preset)
-    methods = [method for method in request.methods if method in known]
-    named = [_Choice(figures.Variant(method), False) for method in methods]
+    known = [method for method in request.methods if not _method_problems(method)]
+    named = [_Choice(figures.Variant(method), False) for method in known]
     for figure in (_FIGURES[a] for a in request.ablations if a in _FIGURES):
         named += [_Choice(variant, figure.is_ablation) for variant in figure.variants]
     union: dict[str, _Choice] = {}
@@ -175,43 +143,47 @@ def _choices(request: Request) -> list[_Choice]:
 
 
 def _configured(
-    request: Request, task: str, choice: _Choice, faults: Faults, where: str
+    request: Request, task: str, choice: _Choice
 ) -> tuple[Config, list[str]]:
-    """Returns config and flags of a task's variant; None as config if it has none."""
-    variant = choice.variant
-    words = [f"--config={_config_file(request.preset, variant.method, task)}"]
-    words += request.overrides
-    words += [f"--config.{name}={value}" for name, value in variant.overrides.items()]
-    given = {_field(word) for word in request.overrides}
-    for field in sorted(given & variant.overrides.keys()):
-        faults.add(f"--config.{field} is what the figure varies: leave it out", where)
-    try:
-        config = read_config(words)
-    except command.UsageError as error:
-        for sentence in str(error).split("\n  - ")[1:]:
-            faults.add(sentence, where)
-        return None, words
+    """Returns the config of a task's variant and the words that make it.
+
+    Raises:
+      UsageError: as `jaxil.launch` would.
+    """
+    method = choice.variant.method
+    own = jaxil_config.fields(method).keys() - _OWN_FLAGS.keys()
+    given = {name: v for name, v in request.overrides.items() if name in own}
+    fields = {**given, **choice.variant.overrides}
+    words = [
+        *_preset(request.preset, method, task),
+        *(f"--config.{name}={value}" for name, value in fields.items()),
+    ]
+    config = command.read_config(words)
     is_short = request.preset == "paper" and choice.has_short_budget
-    chosen = "total_frames" in given
-    if is_short and not chosen and config.total_frames > figures.ABLATION_FRAMES:
-        config.total_frames = figures.ABLATION_FRAMES
-        words.append(f"--config.total_frames={config.total_frames}")
+    frames = figures.ABLATION_FRAMES
+    if is_short and "total_frames" not in given and config.total_frames > frames:
+        config.total_frames = frames
+        words.append(f"--config.total_frames={frames}")
     return config, words
 
 
-def _config_file(preset: str, method: str, task: str) -> str:
-    """Returns FILE:ARGUMENT, seen from the current folder."""
+def _preset(preset: str, method: str, task: str) -> list[str]:
+    """Returns the words of a preset, whose file is seen from the current folder."""
     folder = os.path.relpath(ROOT / "configs")
     if preset == "tiny":
-        return f"{folder}/tiny.py:{method},{task}"
-    return f"{folder}/{method}.py:{task}"
+        return [f"--config={folder}/tiny.py:{method},{task}"]
+    if (ROOT / "configs" / f"{method}.py").is_file():
+        return [f"--config={folder}/{method}.py:{task}"]
+    # A method without a file of its own has its defaults.
+    return [f"--config={folder}/pdac.py:{task}", f"--config.method={method}"]
 
 
 def _seeds(request: Request, config: Config, words: list[str]) -> Iterator[Run]:
     # The settings decide on the name: --config.shift_padding=0 makes another variant.
     slug = figures.variant_of(config.to_dict()).slug
-    for seed in range(max(request.num_seeds, 1)):
+    for seed in range(request.num_seeds):
         folder = request.folder / config.task / slug / f"seed{seed}"
+        own = (f"--config.seed={seed}", f"--workdir={folder}")
         yield Run(
             task=config.task,
             slug=slug,
@@ -219,24 +191,29 @@ def _seeds(request: Request, config: Config, words: list[str]) -> Iterator[Run]:
             seed=seed,
             folder=folder,
             total_frames=config.total_frames,
-            command=(
-                *(sys.executable, "-m", "jaxil.launch"),
-                *words,
-                f"--config.seed={seed}",
-                f"--workdir={folder}",
-            ),
+            command=(sys.executable, "-m", "jaxil.launch", *words, *own),
         )
 
 
-def _check_folders(runs: list[Run], folder: pathlib.Path, faults: Faults) -> None:
-    config = read_config(runs[0].command)
-    for run in runs:
-        config.seed = run.seed
-        for sentence in workdir.problems(run.folder, config):
-            # Without the folder's name, the same fault of many runs is one sentence.
-            shown = sentence.replace(str(run.folder), f"{folder}/TASK/VARIANT/seedN")
-            faults.add(shown, run.name)
+def _folder_problems(sweep: pathlib.Path, run: Run, config: Config) -> Iterator[Fault]:
+    if state.damage(run):  # shown as such; the other runs go on
+        return
+    config.seed = run.seed
+    for fault in workdir.problems(run.folder, config):
+        # With one name for all folders, the same fault of many runs is one fault.
+        yield dataclasses.replace(fault, value=f"{sweep}/TASK/VARIANT/seedN")
 
 
-def _field(word: str) -> str:
-    return word.partition("=")[0].lstrip("-").removeprefix("config.")
+def _each_once(
+    found: Iterable[tuple[Fault | str, str]], everywhere: set[str]
+) -> Iterator[Fault | str]:
+    """Yields each fault once; one that some runs lack says which have it."""
+    places: dict[Fault | str, list[str]] = {}
+    for fault, where in found:
+        places.setdefault(fault, []).append(where)
+    for fault, where in places.items():
+        if "" in where or {*where} >= everywhere:
+            yield fault
+        else:
+            more = ", ..." if len(where) > _SHOWN else ""
+            yield f"{fault} [{', '.join(where[:_SHOWN])}{more}]"

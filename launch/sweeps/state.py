@@ -1,33 +1,48 @@
 """How far a run has come, told from its folder alone.
 
-Nothing else remembers a sweep, so that it can be killed anywhere, watched from
-elsewhere and begun again. Beside what `jaxil.launch` writes, a run's folder holds
+Nothing else remembers a sweep, so it can be killed anywhere, watched from elsewhere and
+started again. Beside what `jaxil.launch` writes, a run's folder holds
 
     log.txt      what its processes have printed
-    claim        locked while a worker, or a process that it started, has the run
-    failed.json  exit status of a process that ended by its own fault
+    claim        locked while a worker has the run
+    failed.json  exit status of a process that failed
     slurm_job    number of the Slurm job that waits for it or runs it
 """
 
 import contextlib
 import csv
 import enum
-import fcntl
+import functools
 import json
+import math
 import os
 import pathlib
-import re
-import time
-from collections.abc import Iterator
-from typing import IO, NamedTuple
+from typing import NamedTuple
 
+from jaxil.errors import UsageError
+from jaxil.files import locking
 from jaxil.files.writing import write_atomically
-from launch.sweeps.plan import Run
+from jaxil.training import workdir
 
-_CHECKPOINT = re.compile(r"frame_(\d+)(?:_\d+)?")
 _TAIL_BYTES = 16_384  # holds many rows of a table, and the last lines of a log
-# Who looks whether a claim is free holds it for a moment; that is not a claim.
-_CLAIM_TRIES, _CLAIM_SECONDS = 5, 0.05
+_COLUMNS = ("frame", "seconds", "task_return_mean")  # read from tables
+
+
+class Run(NamedTuple):
+    """One run, as the worker that trains it has to know it."""
+
+    task: str
+    slug: str  # of the variant
+    method: str
+    seed: int
+    folder: pathlib.Path  # DIR/TASK/SLUG/seedN
+    total_frames: int
+    command: tuple[str, ...]  # trains or resumes it
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return f"{self.task}/{self.slug}/seed{self.seed}"
 
 
 class State(enum.StrEnum):
@@ -35,6 +50,7 @@ class State(enum.StrEnum):
 
     RUNNING = "running"
     FAILED = "failed"
+    DAMAGED = "damaged"  # a file of it cannot be read
     QUEUED = "queued"
     PARTLY_DONE = "partly done"
     MISSING = "missing"
@@ -42,19 +58,12 @@ class State(enum.StrEnum):
 
 
 class Status(NamedTuple):
-    """A run, looked at.
-
-    Attributes:
-      state: see `State`.
-      frame: environment frames in its tables.
-      seconds: that these took, evaluations included.
-      last_return: task return of the newest evaluation; None before the first.
-    """
+    """A run, looked at."""
 
     state: State
-    frame: int
-    seconds: float
-    last_return: float | None
+    frame: int = 0  # the last one in its tables
+    seconds: float = 0.0  # until then, evaluations included
+    last_return: float | None = None  # None before the first evaluation
 
     @property
     def frames_per_second(self) -> float | None:
@@ -69,14 +78,18 @@ def status(run: Run, queued: frozenset[str] = frozenset()) -> Status:
       run: need not have begun.
       queued: the Slurm jobs that wait or run.
     """
-    row = _last_row(run.folder / "train.csv")
-    evaluation = _last_row(run.folder / "eval.csv")
-    last_return = evaluation.get("task_return_mean")
+    try:
+        training = _last_row(run.folder / "train.csv")
+        evaluation = _last_row(run.folder / "eval.csv")
+    except ValueError:
+        state = _state(run, queued)
+        is_open = state in (State.PARTLY_DONE, State.MISSING)
+        return Status(State.DAMAGED if is_open else state)
     return Status(
         state=_state(run, queued),
-        frame=int(row.get("frame", 0)),
-        seconds=float(row.get("seconds", 0.0)),
-        last_return=None if last_return is None else float(last_return),
+        frame=int(training.get("frame", 0)),
+        seconds=training.get("seconds", 0.0),
+        last_return=evaluation.get("task_return_mean"),
     )
 
 
@@ -84,43 +97,41 @@ def is_finished(run: Run) -> bool:
     """Returns whether the budget is used up.
 
     The newest checkpoint decides, as it does for `jaxil.launch`: it is written after
-    the last rows. Where someone has cleared the checkpoints away, the tables do.
+    the last rows. Where someone has removed the checkpoints, the tables do.
     """
-    checkpoints = run.folder / "checkpoints"
-    names = [path.name for path in checkpoints.glob("frame_*")]
-    frames = [int(m[1]) for name in names if (m := _CHECKPOINT.fullmatch(name))]
-    if not frames:
+    frame: float | None = workdir.newest_checkpoint(run.folder)
+    if frame is None:
         tables = (run.folder / name for name in ("train.csv", "eval.csv"))
-        frames = [min(int(_last_row(table).get("frame", 0)) for table in tables)]
-    return max(frames) >= run.total_frames
+        try:
+            frame = min(_last_row(table).get("frame", 0) for table in tables)
+        except ValueError:
+            return False
+    return frame >= run.total_frames
 
 
 def is_in_use(run: Run) -> bool:
     """Returns whether a worker has the run, or someone who started it by hand."""
-    return _is_locked(run.folder / "claim") or _is_locked(run.folder / "lock")
+    # In this order: to look at a lock holds it for a moment, and the process that a
+    # worker starts must not meet that.
+    return any(locking.is_locked(run.folder / name) for name in ("claim", "lock"))
 
 
-@contextlib.contextmanager
-def claimed(run: Run) -> Iterator[IO[str] | None]:
-    """Gives a run to one worker at a time, on all machines that share the folder.
+def damage(run: Run) -> str:
+    """Returns why a run cannot be resumed; "" if it can.
 
-    Yields:
-      The locked file, for the processes that the worker starts to inherit: the run
-      stays claimed until the last of them has ended. None where another has the run.
+    A damaged table is no reason: `jaxil.launch` sets it aside.
     """
-    run.folder.mkdir(parents=True, exist_ok=True)
-    with (run.folder / "claim").open("a") as file:
-        for _ in range(_CLAIM_TRIES):
-            with contextlib.suppress(OSError):
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                yield file
-                return
-            time.sleep(_CLAIM_SECONDS)
-        yield None
+    try:
+        written = (run.folder / "config.json").stat().st_mtime_ns
+    except FileNotFoundError:
+        return ""
+    except OSError as error:
+        return f"{run.folder} is not readable ({error.strerror})"
+    return _config_damage(run.folder, written)
 
 
 def note_failure(run: Run, exit_status: int) -> None:
-    """Notes that the run's process has ended by its own fault."""
+    """Notes that the run's process has failed."""
     content = {"exit_status": exit_status, "command": list(run.command)}
     write_atomically(run.folder / "failed.json", json.dumps(content).encode())
 
@@ -129,13 +140,14 @@ def failure(run: Run) -> int | None:
     """Returns the exit status that `note_failure` noted; None without."""
     try:
         return int(json.loads((run.folder / "failed.json").read_text())["exit_status"])
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return None
 
 
 def forget_failure(run: Run) -> None:
     """Lets workers try the run again."""
-    (run.folder / "failed.json").unlink(missing_ok=True)
+    with contextlib.suppress(OSError):
+        (run.folder / "failed.json").unlink()
 
 
 def note_slurm_job(run: Run, job: str) -> None:
@@ -148,7 +160,7 @@ def slurm_job(run: Run) -> str | None:
     """Returns the Slurm job that was submitted for the run last."""
     try:
         return (run.folder / "slurm_job").read_text()
-    except OSError:
+    except (OSError, ValueError):
         return None
 
 
@@ -161,6 +173,8 @@ def last_lines(run: Run, number: int) -> list[str]:
 
 
 def _state(run: Run, queued: frozenset[str]) -> State:
+    if damage(run):
+        return State.DAMAGED
     if is_in_use(run):
         return State.RUNNING
     if is_finished(run):
@@ -173,31 +187,43 @@ def _state(run: Run, queued: frozenset[str]) -> State:
     return State.PARTLY_DONE if begun else State.MISSING
 
 
-def _is_locked(path: pathlib.Path) -> bool:
+@functools.cache
+def _config_damage(folder: pathlib.Path, written: int) -> str:
+    """Reads a config once for each time at which it was written."""
+    del written
     try:
-        with path.open() as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except FileNotFoundError:
-        return False
-    except OSError:
-        return True
-    return False
+        workdir.read_config(folder)
+    except UsageError as error:
+        return str(error)
+    return ""
 
 
-def _last_row(path: pathlib.Path) -> dict[str, str]:
-    """Returns the last whole row of a table by column, without empty cells."""
+def _last_row(path: pathlib.Path) -> dict[str, float]:
+    """Returns the numbers of a table's last whole row, without empty cells.
+
+    Raises:
+      ValueError: it is no table, or a number is not finite.
+    """
     try:
-        with path.open() as file:
-            header = file.readline()
-        tail = _tail(path)
+        with path.open(newline="") as file:
+            header = file.readline(_TAIL_BYTES)
+        # A row counts once its line has an end: what follows the last one is cut off.
+        *lines, _ = _tail(path).split("\n")
     except OSError:
         return {}
-    # A row counts once its line has an end; a table's first line is the header.
-    lines = tail[: tail.rfind("\n") + 1].splitlines()
-    if not lines or lines[-1] == header.rstrip("\n"):
+    if not lines:
         return {}
-    columns, row = csv.reader([header, lines[-1]])
-    return {name: cell for name, cell in zip(columns, row) if cell}
+    try:
+        columns, row = csv.reader([header, lines[-1]])
+        cells = dict(zip(columns, row, strict=True))
+    except csv.Error as error:
+        raise ValueError(error) from error
+    if cells.get("frame") == "frame":  # the header itself
+        return {}
+    numbers = {name: float(cells[name]) for name in _COLUMNS if cells.get(name)}
+    if "frame" not in numbers or not all(map(math.isfinite, numbers.values())):
+        raise ValueError("the last row has no frame, or numbers that are not finite")
+    return numbers
 
 
 def _tail(path: pathlib.Path) -> str:

@@ -1,11 +1,12 @@
-"""What a sweep shows: the plan, the live table, the failures."""
+"""What a sweep shows: the plan and what it will take, the live table, the failures."""
 
 import collections
 import contextlib
 import shlex
+import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from rich import box
 from rich.console import Console
@@ -14,27 +15,74 @@ from rich.table import Table
 
 from jaxil.machine.progress import duration
 from launch.sweeps import state
-from launch.sweeps.plan import Run
-from launch.sweeps.state import State, Status
+from launch.sweeps.state import Run, State, Status
 
 Statuses = Mapping[Run, Status]
 
 _REFRESH_SECONDS = 3.0
 _LOG_LINES = 8  # shown of a failed run
-_FRAME_LINES = 5  # of the table that are not runs
 _PLAIN_WIDTH = 160  # of a table in a file or pipe, which has no width of its own
+_NUMBERS = ("seed", "frame", "return", "frames/s", "left")
+# Frames per second of one run at a time, where none has been measured. On the CPU, as
+# the README's measurements; of GPUs no run is known yet.
+_GUESSES = {
+    ("paper", "CPU"): 4.0,
+    ("tiny", "CPU"): 40.0,
+    ("paper", "GPU"): 80.0,
+    ("tiny", "GPU"): 150.0,
+}
+_ENOUGH_SECONDS = 60.0  # before that, a run has mostly compiled
+_ENDS = (State.FINISHED, State.FAILED, State.DAMAGED)
 
 
 def print_plan(statuses: Statuses) -> None:
     """Prints how many seeds of each task and variant are in which state."""
-    cells: dict[tuple[str, str], collections.Counter[State]] = {}
+    cells: dict[tuple[str, str], list[Status]] = {}
     for run, status in statuses.items():
-        counter = cells.setdefault((run.task, run.slug), collections.Counter())
-        counter[status.state] += 1
+        cells.setdefault((run.task, run.slug), []).append(status)
     table = _table("task", "variant", "seeds")
-    for (task, slug), counter in sorted(cells.items()):
-        table.add_row(task, slug, _counts(counter))
+    for (task, slug), seeds in sorted(cells.items()):
+        table.add_row(task, slug, _counts(seeds))
     _console().print(table)
+    for run, status in statuses.items():
+        if status.state is State.DAMAGED:
+            table_rule = "its table cannot be read and is set aside when it resumes"
+            print(f"{run.name} is damaged: {state.damage(run) or table_rule}")
+
+
+def estimate(
+    todo: Statuses, statuses: Statuses, *, num_at_once: int, preset: str, on_gpu: bool
+) -> str:
+    """Returns a sentence on what is left.
+
+    Args:
+      todo: the runs to be done.
+      statuses: of all runs of the sweep, which show how fast it goes.
+      num_at_once: runs that go on at a time.
+      preset: see `plan.PRESETS`; it decides where no run has shown its speed.
+      on_gpu: as `preset`.
+    """
+    guess = _GUESSES[preset, "GPU" if on_gpu else "CPU"]
+    measured: dict[str, list[float]] = {}
+    for run, status in statuses.items():
+        speed = status.frames_per_second
+        if speed is not None and status.seconds >= _ENOUGH_SECONDS:
+            measured.setdefault(run.method, []).append(speed)
+    frames = {run: max(run.total_frames - s.frame, 0) for run, s in todo.items()}
+    seconds = [
+        left / statistics.median(measured.get(run.method, [guess]))
+        for run, left in frames.items()
+    ]
+    # The last runs cannot be shared out: no less than the longest one.
+    until_end = max(sum(seconds) / max(num_at_once, 1), *seconds)
+    text = (
+        f"Left to do: {sum(frames.values()):,} frames, {sum(seconds) / 3600:,.1f} hours"
+        f" of runs; about {duration(until_end)} with {num_at_once} at a time"
+    )
+    guessed = {run.method: None for run in todo if run.method not in measured}
+    if guessed:
+        text += f" (a guess: {guess:g} frames/s for {', '.join(guessed)}, unmeasured)"
+    return text
 
 
 def print_failures(statuses: Statuses) -> None:
@@ -42,20 +90,18 @@ def print_failures(statuses: Statuses) -> None:
     for run, status in statuses.items():
         if status.state is State.FAILED:
             print(f"\n{run.name} failed (exit status {state.failure(run)}):")
-            print(
-                "".join(f"    {line}\n" for line in state.last_lines(run, _LOG_LINES))
-            )
-            print(f"  all of it: {run.folder / 'log.txt'}")
+            print(*(f"    {x}" for x in state.last_lines(run, _LOG_LINES)), sep="\n")
+            print(f"\n  all of it: {run.folder / 'log.txt'}")
             print(f"  again, by hand: {shlex.join(run.command)}")
 
 
 def summary(statuses: Statuses) -> str:
     """Returns how many runs are in which state, such as "3 finished, 1 failed"."""
-    return _counts(collections.Counter(s.state for s in statuses.values()))
+    return _counts(statuses.values())
 
 
 def watch(look: Callable[[], Statuses]) -> Statuses:
-    """Shows all runs until each has finished or failed; once where it can't redraw.
+    """Shows all runs until each has ended; once where the table cannot be redrawn.
 
     Args:
       look: returns the runs as they are now.
@@ -63,14 +109,12 @@ def watch(look: Callable[[], Statuses]) -> Statuses:
     console = _console()
     statuses = look()
     if not console.is_terminal:
-        console.print(_live_table(statuses, len(statuses)))
+        console.print(_live_table(statuses))
         return statuses
     with contextlib.suppress(KeyboardInterrupt), Live(console=console) as live:
         while True:
-            live.update(_live_table(statuses, console.height - _FRAME_LINES))
-            if all(
-                s.state in (State.FINISHED, State.FAILED) for s in statuses.values()
-            ):
+            live.update(_live_table(statuses))  # cut where the screen ends
+            if all(status.state in _ENDS for status in statuses.values()):
                 break
             time.sleep(_REFRESH_SECONDS)
             statuses = look()
@@ -82,23 +126,17 @@ def changes(before: dict[Run, State], statuses: Statuses) -> Iterator[str]:
     for run, status in statuses.items():
         if before.get(run) is not status.state:
             before[run] = status.state
-            if status.last_return is None:
-                shown = ""
-            else:
-                shown = f", return {status.last_return:.1f}"
+            result = status.last_return
+            shown = "" if result is None else f", return {result:.1f}"
             yield f"{time.strftime('%H:%M:%S')} {run.name}: {status.state}{shown}"
 
 
-def _live_table(statuses: Statuses, num_rows: int) -> Table:
+def _live_table(statuses: Statuses) -> Table:
     order = list(State)
     rows = sorted(statuses.items(), key=lambda item: order.index(item[1].state))
-    table = _table(
-        *("task", "variant", "seed", "state", "frame", "return", "frames/s", "left")
-    )
-    table.caption = summary(statuses)
-    if len(rows) > num_rows:
-        table.caption += f"; {len(rows) - num_rows} more than there is room for"
-    for run, status in rows[: max(num_rows, 1)]:
+    table = _table("task", "variant", "seed", "state", *_NUMBERS[1:])
+    table.title = summary(statuses)
+    for run, status in rows:
         speed = status.frames_per_second
         left = run.total_frames - status.frame
         is_open = status.state is not State.FINISHED and speed
@@ -116,15 +154,15 @@ def _live_table(statuses: Statuses, num_rows: int) -> Table:
 
 
 def _table(*columns: str) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, caption_justify="left")
+    table = Table(box=box.SIMPLE_HEAD, title_justify="left")
     for column in columns:
-        is_number = column in ("seed", "frame", "return", "frames/s", "left")
-        justify = "right" if is_number else "left"
+        justify = "right" if column in _NUMBERS else "left"
         table.add_column(column, justify=justify, no_wrap=True)
     return table
 
 
-def _counts(counter: collections.Counter[State]) -> str:
+def _counts(statuses: Iterable[Status]) -> str:
+    counter = collections.Counter(status.state for status in statuses)
     return ", ".join(f"{counter[s]} {s}" for s in State if counter[s])
 
 

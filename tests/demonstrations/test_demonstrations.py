@@ -140,14 +140,28 @@ def test_samples_are_stacks_of_one_episode_with_their_actions(batch_size, frame_
     loaded = loading.Demonstrations(
         frames.astype(np.uint8), np.array([6, 6]), actions, actions[..., 0], {}
     )
-    observation, action = loading.sample(
+    observation, action, successor = loading.sample(
+        loaded,
+        np.random.default_rng(batch_size),
+        batch_size,
+        frame_stack=frame_stack,
+        successors=True,
+    )
+    assert successor is not None
+    assert successor.shape == observation.shape
+    plain = loading.sample(
         loaded, np.random.default_rng(batch_size), batch_size, frame_stack=frame_stack
     )
+    assert plain.successor is None
+    np.testing.assert_array_equal(plain.observation, observation)
     assert observation.shape == (batch_size, 2, 2, 3 * frame_stack)
     newest = action[:, 0]
     for age in range(frame_stack):
         expected = np.maximum(newest - age, newest // 10 * 10)
         channel = observation[..., 3 * (frame_stack - 1 - age)]
+        np.testing.assert_array_equal(channel[:, 0, 0], expected)
+        expected = np.maximum(newest + 1 - age, newest // 10 * 10)
+        channel = successor[..., 3 * (frame_stack - 1 - age)]
         np.testing.assert_array_equal(channel[:, 0, 0], expected)
 
 

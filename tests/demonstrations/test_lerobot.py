@@ -150,7 +150,7 @@ def without(name):
 TIME = f"videos/{CAMERA}/from_timestamp"
 ROW_FAULTS = {
     "no column": (EPISODES_FILE, without("length"), "has no column length in file-000"),
-    "an episode too few": (EPISODES_FILE, lambda rows: rows[:2], "has 2 episodes in"),
+    "an episode too few": (EPISODES_FILE, lambda rows: rows[:2], "has 2 episodes, not"),
     "an episode twice": (
         EPISODES_FILE,
         set_row(1, episode_index=0),
@@ -159,17 +159,17 @@ ROW_FAULTS = {
     "words": (
         EPISODES_FILE,
         lambda rows: [{**row, "length": "many"} for row in rows],
-        "has an episode at an impossible place",
+        "has an episode with an invalid location",
     ),
     "fractions": (
         EPISODES_FILE,
         lambda rows: [{**row, "length": 2.5} for row in rows],
-        "has an episode at an impossible place",
+        "has an episode with an invalid location",
     ),
     "an absent number": (
         EPISODES_FILE,
         set_row(1, length=None),
-        "has an episode at an impossible place",
+        "has an episode with an invalid location",
     ),
     "an episode of one frame": (EPISODES_FILE, set_row(0, length=1), "has 1 frames in"),
     "a file that is not there": (
@@ -177,12 +177,12 @@ ROW_FAULTS = {
         set_row(0, data__chunk_index=7),
         None,
     ),
-    "a negative time": (EPISODES_FILE, set_row(0, **{TIME: -1.0}), "impossible place"),
-    "no time": (EPISODES_FILE, set_row(0, **{TIME: float("nan")}), "impossible place"),
+    "a negative time": (EPISODES_FILE, set_row(0, **{TIME: -1.0}), "invalid location"),
+    "no time": (EPISODES_FILE, set_row(0, **{TIME: float("nan")}), "invalid location"),
     "overlapping": (
         EPISODES_FILE,
         set_row(1, **{TIME: 0.1}),
-        "has an episode 1 that begins in the one before",
+        "has an episode 1 that overlaps another",
     ),
     "behind the end": (
         EPISODES_FILE,
@@ -192,15 +192,15 @@ ROW_FAULTS = {
     "another length": (
         EPISODES_FILE,
         set_row(0, length=2),
-        "has other rows in file-000.parquet than the 2 of episode 0",
+        "does not have the 2 rows of episode 0 in file-000.parquet",
     ),
-    "a frame twice": (DATA_FILE, set_row(1, frame_index=0), "has other rows"),
-    "another episode": (DATA_FILE, set_row(0, episode_index=1), "has other rows"),
-    "no rows": (DATA_FILE, lambda rows: rows[:3], "has other rows"),
+    "a frame twice": (DATA_FILE, set_row(1, frame_index=0), "the 2 rows of"),
+    "another episode": (DATA_FILE, set_row(0, episode_index=1), "the 2 rows of"),
+    "no rows": (DATA_FILE, lambda rows: rows[:3], "the 2 rows of"),
     "no action": (
         DATA_FILE,
         set_row(1, action=None),
-        "without a number in action|unequal lengths",
+        "not numbers in action|unequal lengths",
     ),
     "a short action": (
         DATA_FILE,
@@ -210,7 +210,7 @@ ROW_FAULTS = {
     "an action of nothing": (
         DATA_FILE,
         set_row(1, action=[1.0, None]),
-        "without a num",
+        "not numbers in",
     ),
     "two rewards": (
         DATA_FILE,
@@ -233,10 +233,10 @@ def test_rows_that_break_the_rules_are_refused(path, name):
 @pytest.mark.parametrize(
     ("picture", "message"),
     [
-        ({"bytes": None, "path": "/etc/passwd"}, "does not keep its pictures"),
-        ({"bytes": b"\x89PNG\r\n\x1a\n", "path": ""}, "has a damaged picture 0"),
-        ({"path": "a.png"}, "does not keep its pictures"),
-        ("a.png", "does not keep its pictures"),
+        ({"bytes": None, "path": "/etc/passwd"}, "does not store its images"),
+        ({"bytes": b"\x89PNG\r\n\x1a\n", "path": ""}, "has a damaged image 0"),
+        ({"path": "a.png"}, "does not store its images"),
+        ("a.png", "does not store its images"),
     ],
 )
 def test_pictures_that_cannot_be_read_are_refused(tmp_path, picture, message):
@@ -256,14 +256,14 @@ def feature(kind):
 INFO_FAULTS = {
     "old": (
         {"codebase_version": "v2.1"},
-        "codebase_version 'v2.1'; only v3 can be read",
+        "codebase_version 'v2.1', not v3",
     ),
     "no version": ({"codebase_version": 3}, "codebase_version 3"),
     "no rate": ({"fps": 0}, "has fps=0"),
     "endless rate": ({"fps": float("inf")}, "has fps=inf"),
     "rate beyond numbers": ({"fps": 10**400}, "has fps=1000"),
     "rate in words": ({"fps": "10"}, "has fps='10'"),
-    "another rate": ({"fps": 20}, "video file-000.mp4 of 10 frames per second, where"),
+    "another rate": ({"fps": 20}, "video file-000.mp4 of 10 frames per second, but"),
     "no episodes": ({"total_episodes": 0}, "has total_episodes=0"),
     "many episodes": ({"total_episodes": 10**9}, "has total_episodes=1000000000"),
     "no camera": ({"features": {"action": feature("float32")}}, "has 0 cameras"),
@@ -278,10 +278,10 @@ INFO_FAULTS = {
         {"data_path": "data/../../x.parquet"},
         "refers to a file 'data/../../x",
     ),
-    "absolute": ({"data_path": "/etc/passwd"}, "refers to a file '/etc/passwd', which"),
+    "absolute": ({"data_path": "/etc/passwd"}, "refers to a file '/etc/passwd' outs"),
     "empty": ({"video_path": ""}, "refers to a file ''"),
-    "zero byte": ({"video_path": "a\0b"}, "which is not in it"),
-    "half a letter": ({"data_path": "\ud800"}, "which is not in it"),
+    "zero byte": ({"video_path": "a\0b"}, "outside its folder"),
+    "half a letter": ({"data_path": "\ud800"}, "outside its folder"),
     "unreadable camera": (
         {"features": {"a\nb": feature("video")}},
         "has no column vid",
@@ -354,7 +354,7 @@ def test_links_that_lead_outside_are_refused(path, tmp_path, name, folder):
     outside = tmp_path / "outside"
     place.rename(outside)
     place.symlink_to(outside)
-    with pytest.raises(FormatError, match="has a link to somewhere else in"):
+    with pytest.raises(FormatError, match="has a link that leaves its folder in"):
         read(path)
     place.unlink()
     place.symlink_to(place)  # to itself

@@ -17,11 +17,16 @@ import pytest
 
 from jaxil.demonstrations import foreign
 from jaxil.demonstrations.readers.recording import FormatError
-from jaxil.machine.child import Child, ChildError
+from jaxil.machine.child import ChildError, results
 from tests.demonstrations import foreign_files
 
 MAX_BYTES = 64 * 1024**2
-LIMITS = {"seconds": 300.0, "cpu_seconds": 30, "memory_bytes": 2 * 1024**3}
+LIMITS: dict = {
+    "seconds": 300.0,
+    "cpu_seconds": 30,
+    "memory_bytes": 2 * 1024**3,
+    "result_bytes": 1024**3,
+}
 
 
 class Format(NamedTuple):
@@ -48,11 +53,12 @@ def test_damaged_files_are_read_or_refused(name, tmp_path):
     pytest.importorskip(FORMATS[name].library)
     num_mutants = os.environ.get("JAXIL_FUZZ_MUTANTS", FORMATS[name].num_mutants)
     outcomes = []
-    with Child(read_mutants, name, tmp_path, int(num_mutants), **LIMITS) as child:
-        try:
-            outcomes += child
-        except ChildError as error:
-            pytest.fail(f"mutant {len(outcomes)} of {name}: {error}")
+    try:
+        child = results(read_mutants, name, tmp_path, int(num_mutants), **LIMITS)
+        for outcome in child:
+            outcomes.append(outcome)
+    except ChildError as error:
+        pytest.fail(f"mutant {len(outcomes)} of {name}: {error}")
     assert outcomes[0].startswith("read"), outcomes[0]
     assert any(outcome.startswith("refused") for outcome in outcomes)
     assert not any("\n" in outcome or "\x1b" in outcome for outcome in outcomes)

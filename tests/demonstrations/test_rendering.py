@@ -102,7 +102,7 @@ def test_two_processes_render_what_one_renders(alone, tmp_path, caplog):
 def test_lost_processes_are_done_without(number, alone, tmp_path, caplog, monkeypatch):
     calls = []
     if number == signal.SIGSTOP:
-        monkeypatch.setattr(rendering, "_SILENCE_SECONDS", 3.0)
+        monkeypatch.setattr(rendering, "_TIMEOUT_SECONDS", 3.0)
 
     def lose():
         while len(pids := children()) < 2:
@@ -201,7 +201,7 @@ def test_a_parent_that_is_stopped_leaves_nothing(number, alone, tmp_path):
     if number == signal.SIGINT:
         assert rest == "stopped\n"
         assert errors == ""
-    assert not list((tmp_path / "cache").rglob("*.part"))
+    assert not list((tmp_path / "cache").rglob(".tmp-*"))
     found = pixels_in(tmp_path / "cache")
     assert found.items() <= alone[1].items()
     assert found, "the first episode was whole"
@@ -228,7 +228,7 @@ def is_there(pid):
 )
 def test_how_many_processes_pay(cores, gl_name, num_pixels, expected, monkeypatch):
     monkeypatch.setattr(rendering.os, "sched_getaffinity", lambda _: set(range(cores)))
-    assert rendering.how_many(num_pixels, gl_name) == expected
+    assert rendering.num_processes(num_pixels, gl_name) == expected
 
 
 @pytest.mark.parametrize("pays", [True, False])
@@ -244,6 +244,6 @@ def test_processes_are_started_where_they_pay(pays, alone, monkeypatch):
     monkeypatch.setattr(rendering, "_SOFTWARE", ("",))  # every renderer
     monkeypatch.setattr(rendering.os, "sched_getaffinity", lambda _: {0, 1})
     num_pixels = TOTAL * SIZE**2
-    monkeypatch.setattr(rendering, "_WORTH_PIXELS", num_pixels + (not pays))
+    monkeypatch.setattr(rendering, "_MIN_PARALLEL_PIXELS", num_pixels + (not pays))
     np.testing.assert_array_equal(observe(processes=None), alone[0])
     assert started == [2] * pays

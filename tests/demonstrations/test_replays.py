@@ -116,7 +116,7 @@ def test_what_else_is_in_the_folder_is_left_alone(path, tmp_path):
     assert replays.recognises(tmp_path)
     assert not replays.recognises(tmp_path / "pipe.npz")
     recording, (episode,) = read_here(replays, tmp_path)
-    assert recording.notes == ("2 of its 3 .npz files hold no episode.",)
+    assert recording.notes == ("2 of its 3 .npz files are not episodes.",)
     assert_shows(episode, PLAYED)
     with pytest.raises(FormatError, match="holds no episodes"):
         read(tmp_path / "pipe.npz")
@@ -179,25 +179,25 @@ WRONG = {
         {"is_first": np.arange(6) % 3 == 0},
         "more than one episode: is_first is true again",
     ),
-    "DreamerV3": ({"stepid": np.zeros((6, 20), np.uint8)}, "begins with an action"),
+    "DreamerV3": ({"stepid": np.zeros((6, 20), np.uint8)}, "begins with a nonzero"),
     "actions after frames": (
         {"action": np.roll(ENTRIES["action"], -1, axis=0)},
-        "begins with an action, where the reset's zeros belong",
+        "begins with a nonzero action, so",
     ),
-    "NaN for the reset": ({"action": NAN}, "begins with an action"),
+    "NaN for the reset": ({"action": NAN}, "begins with a nonzero"),
     "an action too few": (
         {"action": ENTRIES["action"][:-1]},
-        r"unequal length, or too few steps: .*'action': \(5, 2\)",
+        r"different lengths or too short: .*'action': \(5, 2\)",
     ),
-    "no steps": ({k: v[:1] for k, v in ENTRIES.items()}, "too few steps"),
-    "a number": ({"reward": np.float32(0)}, "unequal length"),
+    "no steps": ({k: v[:1] for k, v in ENTRIES.items()}, "too short"),
+    "a number": ({"reward": np.float32(0)}, "different lengths"),
     "actions without axis": (
         {"action": ENTRIES["action"][:, 0]},
-        r"actions of type float32 and shape \(5,\) in episode 0, where",
+        r"actions of type float32 and shape \(5,\) in episode 0, but",
     ),
     "rewards with axes": (
         {"reward": np.zeros((6, 2))},
-        r"rewards of type float64 and shape \(5, 2\) in episode 0, where",
+        r"rewards of type float64 and shape \(5, 2\) in episode 0, but",
     ),
     "complex actions": (
         {"action": ENTRIES["action"].astype(complex)},
@@ -205,23 +205,23 @@ WRONG = {
     ),
     "grey pictures": (
         {"image": np.zeros((6, 8, 8, 1), np.uint8)},
-        r"shape \(6, 8, 8, 1\), where coloured pictures",
+        r"shape \(6, 8, 8, 1\), not ",
     ),
     "grey stacks": (
         {"image": np.zeros((6, 4, 84, 84), np.uint8)},
-        "where coloured pictures",
+        "not \\[T, 3 n",
     ),
     "states": (
         {"image": np.zeros((6, 9))},
-        "observations of type float64, where uint8",
+        "observations of type float64, not uint8",
     ),
     "flat pictures": (
         {"image": np.zeros((6, 192), np.uint8)},
-        r"shape \(6, 192\), where coloured",
+        r"shape \(6, 192\), not ",
     ),
     "both ways": (
         {"image": np.zeros((6, 3, 3, 3), np.uint8)},
-        "does not tell whether channels come first or last",
+        "ambiguous shape",
     ),
     "objects": ({"action": np.array([{}] * 6, object)}, "action of Python objects"),
     "records": (
@@ -248,7 +248,7 @@ def test_an_array_larger_than_may_be_read(path):
     with pytest.raises(FormatError, match=r"1742 bytes in all .* more than the 1741"):
         read(path, max_bytes=1741)
     with pytest.raises(
-        FormatError, match="image of 1280 bytes, more than the 1279 that"
+        FormatError, match="image of 1280 bytes, more than the 1279 allowed"
     ):
         read(path, max_bytes=1279)
 
@@ -308,19 +308,19 @@ HEADERS = {
     "huge": (npy(HEADER.format("<f4", "(999999999999999999, 2)")), "not as long"),
     "overflow": (
         npy(HEADER.format("<f4", "(4294967296, 4294967296)")),
-        "not as long as it says",
+        "claims a wrong length",
     ),
     "empty and huge": (
         npy(HEADER.format("<f4", "(0, 999999999999999999)")),
-        "unequal length|too big|too large",
+        "different lengths|too big|too large",
     ),
     "many axes": (
         npy(HEADER.format("<f4", f"({'1, ' * 40})"), bytes(4)),
-        "unequal length",
+        "different lengths",
     ),
     "too long": (
         npy(HEADER.format("<f4", "(6, 2)"), bytes(49)),
-        "not as long as it says",
+        "claims a wrong length",
     ),
 }
 
@@ -350,8 +350,8 @@ def bomb(path, *, unpacked, declared):
     ("unpacked", "declared", "message"),
     [
         (100_000_000, 200, "cut off, damaged"),
-        (100_000_000, MAX_BYTES - 2000, "not as long as it says"),
-        (800, MAX_BYTES, "not as long as it says"),
+        (100_000_000, MAX_BYTES - 2000, "claims a wrong length"),
+        (800, MAX_BYTES, "claims a wrong length"),
     ],
 )
 def test_sizes_that_are_not_true(path, unpacked, declared, message):
@@ -373,7 +373,7 @@ def test_sizes_beyond_the_end_of_the_file(path):
     path.write_bytes(content)
     tracemalloc.start()
     try:
-        with pytest.raises(FormatError, match="not as long as it says"):
+        with pytest.raises(FormatError, match="claims a wrong length"):
             read(path, max_bytes=10**9)
         assert tracemalloc.get_traced_memory()[1] < MAX_BYTES
     finally:
@@ -385,7 +385,7 @@ def test_compressions_that_cannot_be_stopped_half_way(path, compression):
     action = io.BytesIO()
     np.save(action, ENTRIES["action"], allow_pickle=False)
     with_member(path, action.getvalue(), compression)
-    with pytest.raises(FormatError, match="packed by a compression that is not read"):
+    with pytest.raises(FormatError, match="unsupported compression"):
         read(path)
 
 

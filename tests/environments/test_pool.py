@@ -58,7 +58,9 @@ def without_jax(make):
     return environment
 
 
-def play(environments, num_episodes, act=lambda seen: seen[:, :1] % 10, each_round=None):
+def play(
+    environments, num_episodes, act=lambda seen: seen[:, :1] % 10, each_round=None
+):
     """Plays whole episodes; returns them by number."""
     player, whole = Player(environments, first_episode=0), {}
     for number in range(100):
@@ -170,7 +172,7 @@ def test_a_lost_process_is_replaced_and_its_episode_played_again(sent, said):
     assert rounds[:4] == steps
     (line,) = lines
     assert f"environment 0 {'did ' * (sent == signal.SIGSTOP)}{said}" in line
-    assert "plays episode 0 from its start" in line
+    assert "restarts episode 0" in line
 
 
 def test_an_error_of_the_environment_is_told_in_full():

@@ -65,23 +65,17 @@ def test_odd_sizes_are_padded(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("left", "right", "fps", "message"),
+    ("left", "right", "message"),
     [
-        (np.zeros((2, 8, 8, 3), np.float32), None, 10, "frames_left = float32"),
-        (np.zeros((2, 8, 8), np.uint8), None, 10, r"expected uint8 \[T, H, W, 3\]"),
-        (np.zeros((0, 8, 8, 3), np.uint8), None, 10, "at least one frame"),
-        (
-            plain_frames(1, (0, 0, 0)),
-            plain_frames(1, (0, 0, 0), (8, 8)),
-            10,
-            "frames_right",
-        ),
-        (plain_frames(1, (0, 0, 0)), None, 0, "fps = 0: expected > 0"),
+        (np.zeros((2, 8, 8, 3), np.float32), None, "frames_left = float32"),
+        (np.zeros((2, 8, 8), np.uint8), None, r"expected uint8 \[T, H, W, 3\]"),
+        (np.zeros((0, 8, 8, 3), np.uint8), None, "at least one frame"),
+        (plain_frames(1, (0, 0, 0)), plain_frames(1, (0, 0, 0), (8, 8)), "frames_righ"),
     ],
 )
-def test_bad_frames_are_refused(tmp_path, left, right, fps, message):
+def test_bad_frames_are_refused(tmp_path, left, right, message):
     with pytest.raises(ValueError, match=message):
-        write_video(tmp_path / "video.mp4", left, right, fps=fps)
+        write_video(tmp_path / "video.mp4", left, right, fps=10)
 
     assert list(tmp_path.iterdir()) == []
 

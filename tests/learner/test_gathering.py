@@ -5,7 +5,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxil.learner.gathering import Frames, make_gathering_step, make_repeated_step
+from jaxil.learner.gathering import (
+    Frames,
+    gather_batch,
+    gather_expert,
+    make_gathering_step,
+    make_repeated_step,
+)
 from jaxil.learner.update import make_update_step
 from jaxil.maths.types import Batch, ExpertBatch
 from tests.learner.test_update import (
@@ -30,41 +36,47 @@ def make_frames() -> Frames:
     )
 
 
-def draw(seed: int) -> tuple[Batch, ExpertBatch]:
+def sample(seed: int) -> tuple[Batch, ExpertBatch]:
     rng = np.random.default_rng(seed)
 
-    def places(size: int) -> np.ndarray:
+    def indices(size: int) -> np.ndarray:
         return rng.integers(NUM_FRAMES, size=(size, STACK)).astype(np.int32)
 
     def numbers(*shape: int) -> np.ndarray:
         return rng.uniform(-1, 1, shape).astype(np.float32)
 
     batch = Batch(
-        observation=places(BATCH),
+        observation=indices(BATCH),
         action=numbers(BATCH, ACTIONS),
         reward=numbers(BATCH),
         discount=numbers(BATCH),
-        next_observation=places(BATCH),
+        next_observation=indices(BATCH),
     )
-    return batch, ExpertBatch(places(4), numbers(4, ACTIONS))
+    return batch, ExpertBatch(indices(4), numbers(4, ACTIONS))
 
 
 def on_host(frames: Frames, batch: Batch, expert: ExpertBatch):
     """Stacks by NumPy's own concatenation."""
 
-    def stacked(row, places):
-        return np.concatenate([row[place] for place in places.T], axis=-1)
+    def stacked(row, indices):
+        return np.concatenate([row[index] for index in indices.T], axis=-1)
 
     experts = np.asarray(frames.expert).reshape(-1, SIDE, SIDE, 3)
-    return batch._replace(
-        observation=stacked(frames.agent, batch.observation),
-        next_observation=stacked(frames.agent, batch.next_observation),
-    ), expert._replace(observation=stacked(experts, expert.observation))
+    stacks = {
+        name: stacked(frames.agent, getattr(batch, name))
+        for name in ("observation", "next_observation", "successor")
+        if getattr(batch, name) is not None
+    }
+    successor = expert.successor
+    return batch._replace(**stacks), expert._replace(
+        observation=stacked(experts, expert.observation),
+        successor=None if successor is None else stacked(experts, successor),
+    )
 
 
-def as_many(*drawn):
-    """Lays batches one behind the other along a new first axis."""
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *drawn)
+def as_many(*sampled):
+    """Stacks batches along a new first axis."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *sampled)
 
 
 LEARNER = make_learner(PDAC)
@@ -73,27 +85,27 @@ SINGLE = jax.jit(STEP)  # compiled once for all tests, for each form of batches
 
 
 def test_frames_on_the_device_change_no_update():
-    frames, drawn, state = make_frames(), draw(0), make_state(LEARNER)
-    gathered, _ = SINGLE(state, *drawn, frames)
-    sent, _ = SINGLE(state, *on_host(frames, *drawn))
+    frames, sampled, state = make_frames(), sample(0), make_state(LEARNER)
+    gathered, _ = SINGLE(state, *sampled, frames)
+    sent, _ = SINGLE(state, *on_host(frames, *sampled))
     assert_identical(gathered, sent)
 
 
 def test_four_updates_in_one_call_are_four_calls():
     chex.clear_trace_counter()
     frames, start = make_frames(), make_state(LEARNER)
-    draws = [draw(seed) for seed in range(NUM_UPDATES)]
+    samples = [sample(seed) for seed in range(NUM_UPDATES)]
     state = start
-    for drawn in draws:
-        state, metrics = SINGLE(state, *drawn, frames)
+    for sampled in samples:
+        state, metrics = SINGLE(state, *sampled, frames)
     counted = chex.assert_max_traces(make_repeated_step(STEP), n=1)
     repeated = jax.jit(counted, donate_argnums=0)
     # Twice from the same start: compiled once, and no call leaves a trace.
     for _ in range(2):
         given = jax.tree.map(jnp.copy, start)
-        at_once, at_once_metrics = repeated(given, *as_many(*draws), frames)
+        at_once, at_once_metrics = repeated(given, *as_many(*samples), frames)
         assert at_once.num_updates == NUM_UPDATES
-        # Equal up to the order of sums, which XLA chooses anew inside a loop.
+        # Equal up to the order of sums, which XLA chooses again inside a loop.
         for name in ("params", "target_critic"):
             ours, theirs = getattr(at_once, name), getattr(state, name)
             chex.assert_trees_all_close(ours, theirs, atol=1e-5)
@@ -103,12 +115,20 @@ def test_four_updates_in_one_call_are_four_calls():
         assert all(leaf.is_deleted() for leaf in jax.tree.leaves(given.params))
 
 
+def test_successors_are_gathered_too():
+    frames, (batch, expert) = make_frames(), sample(0)
+    batch = batch._replace(successor=sample(1)[0].observation)
+    expert = expert._replace(successor=sample(1)[1].observation)
+    gathered = gather_batch(frames.agent, batch), gather_expert(frames.expert, expert)
+    assert_identical(gathered, on_host(frames, batch, expert))
+
+
 def test_the_frames_are_not_copied():
-    frames, drawn = make_frames(), draw(0)
+    frames, sampled = make_frames(), sample(0)
     many = jax.ShapeDtypeStruct((50_000, SIDE, SIDE, 3), np.uint8)  # 22 MB
     lowered = jax.jit(make_repeated_step(STEP)).lower(
         jax.eval_shape(lambda: make_state(LEARNER)),
-        *as_many(*[drawn] * NUM_UPDATES),
+        *as_many(*[sampled] * NUM_UPDATES),
         frames._replace(agent=many),
     )
     memory = lowered.compile().memory_analysis()

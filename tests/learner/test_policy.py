@@ -1,74 +1,50 @@
 """Acting: the mean without noise, and noise whose size follows agent steps."""
 
-from typing import Any
-
-import chex
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxil.learner.policy import make_exploit, make_explore
+from jaxil.learner.policy import make_mean_action, make_sample_action
 from jaxil.networks.agent import apply
-from tests.tiny_agent import make_tiny_networks
+from tests.tiny_agent import NETWORKS, make_params, random_frames
 
-with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
-
-NETWORKS = make_tiny_networks(action_dim=3)
-SCHEDULE = optax.linear_schedule(1.0, 0.0, 1000)
-
-
-def tiny_params():
-    images = np.random.default_rng(0).integers(0, 256, (1, 12, 12, 3), dtype=np.uint8)
-    encoder = NETWORKS.encoder.init(jax.random.key(0), images)
-    representation = apply(NETWORKS.encoder, encoder, images)
-    return encoder, NETWORKS.actor.init(jax.random.key(1), representation), images[0]
+PARAMS = make_params(0)
+ENCODER, ACTOR = PARAMS.encoder, PARAMS.actor
+KEY = jax.random.key(2)
+MEAN = jax.jit(make_mean_action(NETWORKS))
 
 
-class ExploitTest(chex.TestCase):
-    @with_and_without_jit
-    def test_is_the_tanh_of_the_actors_mean(self):
-        encoder, actor, observation = tiny_params()
-        action = self.variant(make_exploit(NETWORKS))(encoder, actor, observation)
-        representation = apply(NETWORKS.encoder, encoder, observation[None])
-        mean = np.tanh(apply(NETWORKS.actor, actor, representation))
-        assert action.shape == (3,)
-        np.testing.assert_allclose(action, mean[0], atol=1e-6)
+def test_the_mean_action_is_the_tanh_of_the_actors_output():
+    observations = random_frames(0, 3)
+    representation = apply(NETWORKS.encoder, ENCODER, observations)
+    mean = np.tanh(apply(NETWORKS.actor, ACTOR, representation))
+    action = MEAN(ENCODER, ACTOR, observations)
+    assert action.shape == (3, 2)
+    np.testing.assert_allclose(action, mean, atol=1e-6)
 
 
-class ExploreTest(chex.TestCase):
-    @with_and_without_jit
-    def test_adds_noise_of_the_schedules_size(self):
-        encoder, actor, observation = tiny_params()
-        mean = make_exploit(NETWORKS)(encoder, actor, observation)
-        explore = self.variant(make_explore(NETWORKS, SCHEDULE))
-        key = jax.random.key(2)
-        for num_steps, std in ((0, 1.0), (500, 0.5), (900, 0.1)):
-            action = explore(encoder, actor, observation, key, jnp.uint32(num_steps))
-            noise = jax.random.normal(jax.random.fold_in(key, num_steps), (3,))
-            expected = np.clip(mean + std * noise, -1 + 1e-6, 1 - 1e-6)
-            np.testing.assert_allclose(action, expected, atol=1e-6)
+def test_noise_has_the_schedules_size_and_its_draw_follows_from_the_step():
+    schedule = optax.linear_schedule(1.0, 0.0, 1000)
+    sample_action = jax.jit(make_sample_action(NETWORKS, schedule))
+    steps = np.array([0, 500, 900, 5000], np.uint32)
+    observations = random_frames(0, len(steps))
+    means = MEAN(ENCODER, ACTOR, observations)
+    actions = sample_action(ENCODER, ACTOR, observations, KEY, steps)
+    for mean, action, step, std in zip(means, actions, steps, (1.0, 0.5, 0.1, 0.0)):
+        noise = jax.random.normal(jax.random.fold_in(KEY, step), (2,))
+        expected = np.clip(mean + std * noise, -1 + 1e-6, 1 - 1e-6)
+        np.testing.assert_allclose(action, expected, atol=1e-6)
+    # An action depends on its own row alone, so that environments side by side play
+    # what each of them would play alone.
+    alone = sample_action(ENCODER, ACTOR, observations[1:2], KEY, steps[1:2])
+    np.testing.assert_allclose(alone[0], actions[1], atol=1e-6)
 
-    def test_ends_without_noise(self):
-        encoder, actor, observation = tiny_params()
-        explore = make_explore(NETWORKS, SCHEDULE)
-        action = explore(
-            encoder, actor, observation, jax.random.key(2), jnp.uint32(5000)
-        )
-        np.testing.assert_array_equal(
-            action, make_exploit(NETWORKS)(encoder, actor, observation)
-        )
 
-    def test_noise_is_not_clipped_as_in_updates(self):
-        encoder, actor, observation = tiny_params()
-        mean = np.asarray(make_exploit(NETWORKS)(encoder, actor, observation))
-        explore = jax.jit(make_explore(NETWORKS, optax.constant_schedule(0.5)))
-        actions = np.stack(
-            [
-                explore(encoder, actor, observation, jax.random.key(2), jnp.uint32(n))
-                for n in range(50)
-            ]
-        )
-        assert np.all(np.abs(actions) < 1.0)
-        assert np.abs(actions - mean[None]).max() > 0.6  # the clip would be 0.3
-        assert len(np.unique(actions, axis=0)) == 50  # each step draws afresh
+def test_noise_is_not_clipped_as_in_updates():
+    sample_action = make_sample_action(NETWORKS, optax.constant_schedule(0.5))
+    observations = random_frames(0, 1).repeat(50, axis=0)
+    mean = np.asarray(MEAN(ENCODER, ACTOR, observations))
+    actions = sample_action(ENCODER, ACTOR, observations, KEY, np.arange(50))
+    assert np.all(np.abs(actions) < 1.0)
+    assert np.abs(actions - mean).max() > 0.6  # the clip would be 0.3
+    assert len(np.unique(actions, axis=0)) == 50  # each step has noise of its own

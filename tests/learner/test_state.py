@@ -14,8 +14,8 @@ from jaxil.learner.state import (
 )
 from jaxil.learner.update import Learner, init_train_state, make_update_step
 from jaxil.maths.types import Batch
-from jaxil.rewarders.task import make_task_rewarder
-from tests.tiny_agent import make_tiny_networks
+from jaxil.rewarders import drqv2
+from tests.tiny_agent import make_agent, make_tiny_networks
 
 SPEC = Spec(2, 5, num_demonstrations=0, expert_steps=0, observation_shape=(12, 12, 6))
 
@@ -24,7 +24,7 @@ def tiny_learner():
     networks = make_tiny_networks(observation="state")
     return Learner(
         networks=networks,
-        rewarder=make_task_rewarder(),
+        rewarder=drqv2.make_rewarder(make_agent()),
         learning_rate=1e-3,
         critic_target_tau=0.01,
         noise_clip=0.3,
@@ -54,7 +54,7 @@ def test_the_first_adam_step_is_the_sign_of_the_gradient():
     np.testing.assert_array_equal(module.params["w"], [1.0, 2.0, 3.0])
 
 
-def test_statistics_are_carried_on():
+def test_optimiser_statistics_are_kept():
     # Equal gradients twice: the bias-corrected moments are g and g^2 again.
     optimiser = optax.adam(0.1)
     module = init_module(jnp.array(1.0), optimiser)
@@ -63,7 +63,7 @@ def test_statistics_are_carried_on():
         np.testing.assert_allclose(module.params, expected, rtol=1e-5)
 
 
-def test_copies_have_buffers_of_their_own():
+def test_copies_have_their_own_buffers():
     params = {"a": jnp.arange(3.0), "b": {"c": jnp.ones((2, 2))}}
     copies = copy_params(params)
     jax.tree.map(np.testing.assert_array_equal, params, copies)
@@ -88,7 +88,7 @@ def test_targets_start_as_the_critic_in_other_buffers():
     assert state.num_updates.dtype == jnp.int32
 
 
-def test_a_seed_says_all():
+def test_the_seed_fixes_all_parameters():
     first, again, other = (tiny_state(seed).params for seed in (0, 0, 1))
     jax.tree.map(np.testing.assert_array_equal, first, again)
     differs = jax.tree.map(lambda a, b: bool(jnp.any(a != b)), first, other)
@@ -96,7 +96,7 @@ def test_a_seed_says_all():
     assert differs.critic["params"]["trunk"]["project"]["kernel"]
 
 
-def test_actor_and_critic_trunks_are_drawn_apart():
+def test_actor_and_critic_trunks_start_differently():
     params = tiny_state().params
     actor, critic = (
         tree["params"]["trunk"]["project"]["kernel"] for tree in params[1:]

@@ -10,16 +10,13 @@ import numpy as np
 import optax
 import pytest
 
-from jaxil.learner.rewarder import Rewarder, Spec
+from jaxil.learner.rewarder import AgentSpec, Rewarder, Spec
 from jaxil.learner.update import Learner, init_train_state, make_update_step
-from jaxil.maths.types import Batch, Episode, ExpertBatch, ExpertEpisodes, Window
+from jaxil.maths.types import Batch, ExpertBatch, Window
 from jaxil.native import build
 from jaxil.networks.agent import apply, critic_features
-from jaxil.rewarders.matching import make_matching
-from jaxil.rewarders.pdac import make_adversarial_rewarder
-from jaxil.rewarders.psil import make_sinkhorn_rewarder
-from jaxil.rewarders.task import make_task_rewarder
-from tests.tiny_agent import make_tiny_networks
+from jaxil.rewarders import drqv2, pdac, psil
+from tests.tiny_agent import make_episode, make_experts, make_tiny_networks
 
 SIDE, CHANNELS, ACTIONS, BATCH, PADDING = 12, 6, 2, 8, 2
 TAU, NOISE_CLIP, LEARNING_RATE = 0.05, 0.3, 3e-3
@@ -41,30 +38,29 @@ NETWORKS = make_tiny_networks(
 
 
 # Made once: a learner is compiled once for all tests that share it.
-TASK = make_task_rewarder()
-PDAC = make_adversarial_rewarder(
-    NETWORKS,
+AGENT = AgentSpec(NETWORKS, SPEC.feature_dim, frame_stack=2, shift_padding=PADDING)
+DRQV2 = drqv2.make_rewarder(AGENT)
+PDAC = pdac.make_rewarder(
+    AGENT,
     hidden_dim=8,
     learning_rate=1e-2,
-    penalty_weight=10.0,
+    gradient_penalty=10.0,
     batch_size=4,
     sees_actions=False,
-    shift_padding=PADDING,
-    frame_stack=2,
 )
-PSIL = make_sinkhorn_rewarder(
-    NETWORKS,
-    matching=make_matching(
-        cost="cosine", alignment="transport", epsilon=0.01, num_iterations=20
-    ),
+PSIL = psil.make_rewarder(
+    AGENT,
+    cost="cosine",
+    alignment="transport",
+    epsilon=0.01,
+    num_iterations=20,
     target_update_steps=10,
     return_scale=10.0,
-    frame_stack=2,
 )
 QUIET = optax.constant_schedule(0.0)
 
 
-def make_learner(rewarder: Rewarder = TASK, **changes) -> Learner:
+def make_learner(rewarder: Rewarder = DRQV2, **changes) -> Learner:
     learner = Learner(
         networks=NETWORKS,
         rewarder=rewarder,
@@ -192,9 +188,9 @@ def plain_update(agent: PlainAgent, batch: Batch, key, number: int, mistake: str
         new = optax.apply_updates(getattr(agent, name), updates)
         setattr(agent, name, new)
 
-    def noise(draw_key):
+    def noise(noise_key):
         bound = 9.0 if mistake == "noise not clipped" else NOISE_CLIP
-        normal = jax.random.normal(draw_key, (BATCH, ACTIONS))
+        normal = jax.random.normal(noise_key, (BATCH, ACTIONS))
         return jnp.clip(std * normal, -bound, bound)
 
     # Critic and encoder.
@@ -370,9 +366,10 @@ def test_the_discriminator_moves_nothing_else():
     assert_identical(first.replace(rewarder=()), second.replace(rewarder=()))
 
 
-def test_rewards_made_anew_replace_the_stored_ones():
-    # A rewarder that pays the first action, plus what it has seen of itself.
-    paid = TASK._replace(relabel=lambda state, learner, window: window.action[..., 0])
+def test_relabelled_rewards_replace_the_stored_ones():
+    paid = DRQV2._replace(
+        relabel=lambda state, learner, batch: batch.window.action[..., 0]
+    )
     batch, rng = make_batch(0), np.random.default_rng(0)
     window = Window(
         observation=np.stack([batch.observation] * 3, axis=1),
@@ -380,16 +377,16 @@ def test_rewards_made_anew_replace_the_stored_ones():
         weight=rng.uniform(size=(BATCH, 3)).astype(np.float32),
     )
     reward = np.sum(window.weight * window.action[..., 0], axis=1)
-    anew, anew_metrics = jitted(make_learner(paid))(
+    relabelled, relabelled_metrics = jitted(make_learner(paid))(
         make_state(make_learner(paid)), batch._replace(window=window), None
     )
     stored, stored_metrics = jitted(make_learner())(
         make_state(make_learner()), batch._replace(reward=reward), None
     )
-    chex.assert_trees_all_close(anew_metrics, stored_metrics, rtol=1e-5)
-    chex.assert_trees_all_close(anew.params, stored.params, rtol=1e-4, atol=1e-6)
+    chex.assert_trees_all_close(relabelled_metrics, stored_metrics, rtol=1e-5)
+    chex.assert_trees_all_close(relabelled.params, stored.params, rtol=1e-4, atol=1e-6)
     _, other = jitted(make_learner())(make_state(make_learner()), batch, None)
-    assert abs(other["batch/reward"] - anew_metrics["batch/reward"]) > 0.1
+    assert abs(other["batch/reward"] - relabelled_metrics["batch/reward"]) > 0.1
 
 
 def test_a_rewarder_with_nothing_to_learn_is_left_alone():
@@ -433,37 +430,112 @@ def test_the_pre_tanh_penalty_is_a_mean_square():
 # What the rewarder is shown ----------------------------------------------------
 
 
-def make_spy() -> Rewarder:
-    """A rewarder that remembers what it was given."""
+def seen_by_rewarder(**changes):
+    """Returns what a rewarder that remembers its arguments was given in one update."""
 
     def update(state, learner, agent, expert, key):
-        return {"learner": learner, "agent": agent, "key": key}, {"spy": jnp.ones(())}
+        return {"learner": learner, "agent": agent, "expert": expert}, {"spy": 1.0}
 
-    def init(key, spec, learner):
-        return ()
-
-    def rewards(state, learner, episode, expert_episodes):
-        return episode.task_rewards, state
-
-    return Rewarder(init, update, rewards, samples_expert=False, matches_episodes=False)
-
-
-def test_the_rewarder_sees_augmented_features_of_before_the_update():
-    learner = make_learner(make_spy())
-    state, batch = make_state(learner), make_batch(0)
-    after, metrics = jitted(learner)(state, batch, None)
-    seen = after.rewarder
+    learner = make_learner(DRQV2._replace(update=update, **changes))
+    state = make_state(learner)
+    batch = make_batch(0)._replace(successor=make_batch(1).observation)
+    expert = make_expert(0)._replace(successor=make_expert(1).observation)
+    after, metrics = jax.jit(make_update_step(learner))(state, batch, expert)
     assert metrics["spy"] == 1.0
-    assert_identical(seen["learner"], state.params)
+    return state, batch, expert, after
+
+
+def test_the_rewarder_sees_augmented_features_from_before_the_update():
+    state, batch, _, after = seen_by_rewarder()
+    seen, agent = after.rewarder["learner"], after.rewarder["agent"]
+    assert_identical(seen, state.params)
     assert any_difference(after.params, state.params)
     shift_key = jax.random.split(jax.random.fold_in(state.key, 0), 5)[0]
     shifted = plain_shift(batch.observation, shift_key)
-    np.testing.assert_array_equal(seen["agent"].observation, shifted)
-    np.testing.assert_array_equal(seen["agent"].action, batch.action)
-    features = critic_features(
-        NETWORKS, state.encoder.params, state.critic.params, jnp.asarray(shifted)
+    np.testing.assert_array_equal(agent.observation, shifted)
+    np.testing.assert_array_equal(agent.unshifted, batch.observation)
+    np.testing.assert_array_equal(agent.action, batch.action)
+    np.testing.assert_allclose(agent.features, features_of(state, shifted), atol=1e-5)
+    assert agent.successor is None
+    assert agent.successor_features is None
+
+
+def features_of(state, observation):
+    encoder, critic = state.encoder.params, state.critic.params
+    return critic_features(NETWORKS, encoder, critic, jnp.asarray(observation))
+
+
+def test_successors_come_augmented_with_their_features_and_change_nothing_else():
+    _, _, _, without = seen_by_rewarder()
+    state, batch, expert, after = seen_by_rewarder(samples_successors=True)
+    agent = after.rewarder["agent"]
+    padded = np.pad(
+        batch.successor,
+        ((0, 0), (PADDING, PADDING), (PADDING, PADDING), (0, 0)),
+        mode="edge",
     )
-    np.testing.assert_allclose(seen["agent"].features, features, atol=1e-5)
+    crops = np.lib.stride_tricks.sliding_window_view(padded, (SIDE, SIDE), (1, 2))
+    crops = np.moveaxis(crops, 3, -1)  # [B, 5, 5, SIDE, SIDE, C]
+    matches = np.all(
+        crops == np.asarray(agent.successor)[:, None, None], axis=(3, 4, 5)
+    )
+    assert np.all(matches.sum(axis=(1, 2)) == 1)  # each is one of the 25 shifts
+    assert len({tuple(np.argwhere(m)[0]) for m in matches}) > 1
+    features = features_of(state, agent.successor)
+    np.testing.assert_allclose(agent.successor_features, features, atol=1e-5)
+    np.testing.assert_array_equal(after.rewarder["expert"].successor, expert.successor)
+    # The learner, and what the rewarder saw before, are the same to the last bit.
+    assert_identical(after.replace(rewarder=()), without.replace(rewarder=()))
+    assert_identical(
+        agent._replace(successor=None, successor_features=None),
+        without.rewarder["agent"],
+    )
+
+
+# A method's own term in the actor's loss ---------------------------------------
+
+
+def with_actor_loss(actor_loss) -> Learner:
+    return make_learner(DRQV2._replace(actor_loss=actor_loss), exploration_std=QUIET)
+
+
+def test_a_term_in_the_actors_loss_pulls_the_policy_and_nothing_else():
+    target = np.array([0.8, -0.8], np.float32)
+
+    def mean_action(learner, observation):
+        z = jax.lax.stop_gradient(apply(NETWORKS.encoder, learner.encoder, observation))
+        return jnp.tanh(apply(NETWORKS.actor, learner.actor, z))
+
+    def pull(state, learner, agent, expert, key):
+        error = mean_action(learner, expert.observation) - target[None]
+        return 100.0 * jnp.mean(error**2)
+
+    learner, expert = with_actor_loss(pull), make_expert(0)
+    state = start = make_state(learner)
+    for _ in range(400):
+        state, metrics = jitted(learner)(state, make_batch(0), expert)
+        assert np.isfinite(metrics["actor/loss"])
+    before, after = (
+        np.abs(mean_action(s.params, expert.observation) - target).max()
+        for s in (start, state)
+    )
+    assert after < 0.25 < before
+    # One update with and without it: only the actor differs.
+    pulled, plain = (
+        jitted(each)(start, make_batch(0), expert)[0]
+        for each in (learner, with_actor_loss(None))
+    )
+    assert any_difference(pulled.actor, plain.actor)
+    assert_identical(pulled.replace(actor=()), plain.replace(actor=()))
+
+
+def test_a_term_of_zero_changes_nothing():
+    zero = with_actor_loss(lambda state, learner, agent, expert, key: jnp.zeros(()))
+    first, second = (
+        jitted(learner)(make_state(learner), make_batch(0), None)
+        for learner in (zero, with_actor_loss(None))
+    )
+    assert_identical(first, second)
 
 
 # Keys, schedules, compilation --------------------------------------------------
@@ -494,7 +566,7 @@ def test_noise_follows_the_number_of_the_update(num_updates, std):
 
 @pytest.mark.parametrize(
     ("rewarder", "expert"),
-    [(TASK, None), (PDAC, make_expert), (PSIL, None)],
+    [(DRQV2, None), (PDAC, make_expert), (PSIL, None)],
     ids=["drqv2", "pdac", "psil"],
 )
 def test_compiles_once_and_donates_its_state(rewarder, expert):
@@ -502,14 +574,11 @@ def test_compiles_once_and_donates_its_state(rewarder, expert):
     chex.clear_trace_counter()
     counted = chex.assert_max_traces(make_update_step(learner), n=1)
     step = jax.jit(counted, donate_argnums=0)
-    rewards = jax.jit(learner.rewarder.rewards)
+    observe = jax.jit(learner.rewarder.observe)
     state = make_state(learner)
     rng = np.random.default_rng(0)
     frames = rng.integers(0, 256, (3, 4, SIDE, SIDE, CHANNELS // 2), dtype=np.uint8)
-    episode = Episode(frames[0], np.zeros((3, ACTIONS), np.float32), np.zeros(3))
-    experts = ExpertEpisodes(
-        frames[1:], np.array([4, 4]), np.zeros((2, 3, ACTIONS), np.float32)
-    )
+    episode, experts = make_episode(frames[0]), make_experts(frames[1:])
     for seed in range(3):
         old = state
         state, _ = step(
@@ -517,8 +586,8 @@ def test_compiles_once_and_donates_its_state(rewarder, expert):
         )
         assert all(leaf.is_deleted() for leaf in jax.tree.leaves(old.params))
         # An episode in between must not change the state's types.
-        _, rewarder_state = rewards(state.rewarder, state.params, episode, experts)
-        state = state.replace(rewarder=rewarder_state)
+        observed = observe(state.rewarder, state.params, episode, experts)
+        state = state.replace(rewarder=observed)
     chex.assert_tree_all_finite(state.params)
 
 

@@ -1,4 +1,4 @@
-"""A function in a process of its own: what comes back, and how it ends."""
+"""A generator function in a child process: its results, and how it fails."""
 
 import os
 import pathlib
@@ -9,17 +9,24 @@ import time
 import numpy as np
 import pytest
 
-from jaxil.machine.child import Child, ChildError
+from jaxil.machine.child import ChildError, results
+
+LIMITS: dict = {
+    "seconds": 60.0,
+    "cpu_seconds": 20,
+    "memory_bytes": 2**29,
+    "result_bytes": 10**8,
+}
 
 
-def echo(prefix):
-    request = yield "ready"
-    while request is not None:
-        request = yield [prefix, request]
+def echo(prefix, items):
+    yield "ready"
+    for item in items:
+        yield [prefix, item]
 
 
 def misbehave(how):
-    yield "ready"
+    yield os.getpid()
     if how == "raises":
         raise KeyError("x")
     if how == "crashes":
@@ -47,22 +54,26 @@ def test_requests_and_answers_of_all_kinds():
         "empty": np.zeros((0, 3), np.float32),
         "large": np.arange(3 * 10**6, dtype=np.int32).reshape(3, -1).T,
     }
-    with Child(echo, ">") as child:
-        assert next(child) == "ready"
-        for _ in range(2):
-            child.ask(sent)
-            prefix, answer = child.answer()
-            assert prefix == ">"
-            assert answer.keys() == sent.keys()
-            for name, value in sent.items():
-                if isinstance(value, np.ndarray):
-                    np.testing.assert_array_equal(answer[name], value, strict=True)
-                else:
-                    assert answer[name] == value
-        child.ask(np.float32(0.5))
-        assert child.answer() == [">", 0.5]
-        with pytest.raises(StopIteration):
-            next(child)
+    scalar = np.float32(0.5)
+    ready, *answers, last = results(echo, ">", [sent, sent, scalar], **LIMITS)
+    assert ready == "ready"
+    assert last == [">", 0.5]
+    for prefix, answer in answers:
+        assert prefix == ">"
+        assert answer.keys() == sent.keys()
+        for name, value in sent.items():
+            if isinstance(value, np.ndarray):
+                np.testing.assert_array_equal(answer[name], value, strict=True)
+            else:
+                assert answer[name] == value
+
+
+def test_a_child_ends_with_its_last_reader():
+    child = results(misbehave, "waits for ever", **LIMITS)
+    pid = next(child)
+    child.close()
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
 
 
 @pytest.mark.parametrize(
@@ -72,33 +83,31 @@ def test_requests_and_answers_of_all_kinds():
         ("crashes", "death", "SIGABRT"),
         ("exits", "death", "exit status 3"),
         ("computes for ever", "timeout", "computed for 1 s"),
-        ("waits for ever", "timeout", "within 3.0 s"),
+        ("waits for ever", "timeout", "within 5.0 s"),
         ("fills the memory", "MemoryError", "MemoryError"),
-        ("sends too much", "death", "understood"),
-        ("sends objects", "death", "understood"),
+        ("sends too much", "death", "invalid result"),
+        ("sends objects", "death", "invalid result|exit status 1"),
     ],
 )
 def test_faults_of_the_child_are_named(how, kind, text, monkeypatch):
     monkeypatch.setattr("jaxil.machine.child._EXIT_SECONDS", 0.1)
-    limits = {"cpu_seconds": 1, "memory_bytes": 2**29, "answer_bytes": 10**6}
-    with Child(misbehave, how, seconds=60.0, **limits) as child:
-        assert next(child) == "ready"
-        if how == "waits for ever":
-            child._seconds = 3.0
-        with pytest.raises(ChildError, match=text) as caught:
-            next(child)
+    limits = LIMITS | {"cpu_seconds": 1, "result_bytes": 10**6}
+    if how == "waits for ever":
+        limits["seconds"] = 5.0
+    child = results(misbehave, how, **limits)
+    next(child)
+    with pytest.raises(ChildError, match=text) as caught:
+        next(child)
     assert caught.value.kind == kind
-    assert child._process.returncode is not None
 
 
 def test_a_script_without_main_guard_is_not_run_again(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
-        "from jaxil.machine.child import Child\n"
-        "from tests.machine.test_child import echo\n"
+        "from jaxil.machine.child import results\n"
+        "from tests.machine.test_child import LIMITS, echo\n"
         "print('once')\n"
-        "with Child(echo, '') as child:\n"
-        "    print(next(child))\n"
+        "print(*results(echo, '', [], **LIMITS))\n"
     )
     root = pathlib.Path(__file__).parent.parent.parent
     done = subprocess.run(

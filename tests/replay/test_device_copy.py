@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxil.learner.gathering import gather_batch, gather_expert, gather_stacks
+from jaxil.learner.gathering import gather_batch, gather_expert
 from jaxil.maths.types import ExpertBatch
 from jaxil.replay import device_copy
 from jaxil.replay.device_copy import DeviceCopy
@@ -79,15 +79,6 @@ def test_stacks_from_the_device_are_those_of_the_host(
     for ours, theirs in zip(*leaves, strict=True):
         assert ours.dtype == theirs.dtype
         np.testing.assert_array_equal(ours, theirs)
-
-
-def test_channels_by_hand():
-    # Frame number n has the channels 10 n, 10 n + 1, 10 n + 2.
-    frames = 10 * np.arange(4)[:, None, None, None] + np.arange(3)
-    stacks = gather_stacks(frames.astype(np.uint8), np.array([[0, 0, 1], [1, 2, 3]]))
-    assert stacks.shape == (2, 1, 1, 9)
-    assert stacks[0, 0, 0].tolist() == [0, 1, 2, 0, 1, 2, 10, 11, 12]
-    assert stacks[1, 0, 0].tolist() == [10, 11, 12, 20, 21, 22, 30, 31, 32]
 
 
 def test_expert_frames_lie_end_to_end():

@@ -141,14 +141,40 @@ def test_all_of_a_window_by_hand():
     np.testing.assert_array_equal(batch.window.weight, [[1, 0.5, 0.125]] * 2)
     np.testing.assert_array_equal(batch.reward, [1 + 5 + 12.5] * 2)
     np.testing.assert_array_equal(batch.next_observation, [[3]] * 2)
-    # The same draw without windows is the same batch.
+    # The same sample without windows is the same batch.
     plain = replay.sample(np.random.default_rng(0), 2)
     assert plain.window is None
     for name in ("observation", "action", "reward", "discount", "next_observation"):
         np.testing.assert_array_equal(getattr(plain, name), getattr(batch, name))
 
 
-def test_every_window_is_drawn_equally_often():
+def test_successors_are_one_step_later_in_the_same_episode():
+    # Frame t of episode e holds 10 e + t; the ring has lost the first two.
+    replay = make_replay(observation_shape=(1, 1, 1))
+    for number in range(5):
+        frames = (10 * number + np.arange(5)).astype(np.uint8)
+        episode = make_episode(4, number) | {"frames": frames.reshape(5, 1, 1, 1)}
+        replay.add_episode(**episode)
+    batch = replay.sample(np.random.default_rng(0), 50, windows=True, successors=True)
+    assert batch.successor is not None
+    stacks, successors = batch.observation[:, 0, 0], batch.successor[:, 0, 0]
+    np.testing.assert_array_equal(successors[:, -1], stacks[:, -1] + 1)
+    # Their older frames are the observation's newer ones, also at an episode's start.
+    np.testing.assert_array_equal(successors[:, :-1], stacks[:, 1:])
+    assert len(np.unique(stacks[:, -1])) == 6  # two windows in each of three episodes
+    assert batch.window is not None
+    np.testing.assert_array_equal(batch.window.observation[:, 1], batch.successor)
+    # They change nothing else of what is sampled.
+    plain = replay.sample(np.random.default_rng(0), 50, windows=True)
+    assert plain.successor is None
+    assert plain.window is not None
+    for ours, theirs in zip(plain.window, batch.window):
+        np.testing.assert_array_equal(ours, theirs)
+    for name in ("observation", "action", "reward", "discount", "next_observation"):
+        np.testing.assert_array_equal(getattr(plain, name), getattr(batch, name))
+
+
+def test_every_window_is_sampled_equally_often():
     replay = make_replay()
     episodes = [make_episode(length, seed) for seed, length in enumerate((3, 2, 7))]
     for episode in episodes:

@@ -3,7 +3,8 @@
 import pytest
 
 from jaxil import config as jaxil_config
-from jaxil.reporting.figures import FIGURES, METHOD_NAMES, Variant, variant_of
+from jaxil import methods
+from jaxil.reporting.figures import FIGURES, Variant, variant_of
 
 EVERY = sorted(
     {variant.slug: variant for f in FIGURES.values() for variant in f.variants}.items()
@@ -21,8 +22,27 @@ def test_every_figure_with_curves_or_bars_is_there():
     }
 
 
-def test_every_method_has_a_name():
-    assert set(METHOD_NAMES) == set(jaxil_config.METHODS)
+def test_every_declared_variation_has_a_name():
+    for name, method in methods.known().items():
+        assert Variant(name).label == method.label
+        for field, plain, words in method.variations:
+            label = Variant(name, {field: plain}).label
+            assert label == f"{method.label}, {words.format(plain)}"
+
+
+def test_methods_from_outside_and_missing_ones_have_names(tmp_path, monkeypatch):
+    (tmp_path / "outside.py").write_text(
+        "from jaxil import methods\n"
+        "METHOD = methods.Method(name='mine', label='Mine', about='', variations=(\n"
+        "    methods.Variation('own.size', 1, 'size {}'),))\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    variant = variant_of({"method": "outside:METHOD", "own": {"size": 2}})
+    assert (variant.label, variant.slug) == ("Mine, size 2", "outside_METHOD_size_2")
+    gone = variant_of({"method": "no/such.module:METHOD", "shift_padding": 0})
+    assert gone.label == "no/such.module:METHOD, no augmentation"
+    assert gone.slug == "no_such.module_METHOD_no_augmentation"
+    assert len(Variant("é" * 500).slug.encode()) <= 255
 
 
 @pytest.mark.parametrize("variant", [v for _, v in EVERY], ids=[s for s, _ in EVERY])

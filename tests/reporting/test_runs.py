@@ -5,8 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from jaxil.reporting import groups, runs, summary
-from jaxil.reporting.results import make_study
+from jaxil.reporting import groups, remarks, runs, tables
 from tests.reporting.run_folders import EVAL_HEADER, many_runs, write_run
 
 
@@ -78,6 +77,9 @@ def test_a_frame_written_twice_counts_once_with_its_last_row(tmp_path):
         ("nothing\n", "frame"),
         (f"{EVAL_HEADER}\n1,2,3\n", "damaged"),
         (f"{EVAL_HEADER}\n1,2,3,good,1,1,1\n", "damaged"),
+        (f"{EVAL_HEADER}\n1,2,3,{'9' * 140_000},1,1,1\n", "damaged"),
+        (f"{EVAL_HEADER}\n1,2,3,{'9' * 400},1,1,1\n", "rows without a number"),
+        (f"{EVAL_HEADER}\n1,2,3,1e308,1,1,1\n", "rows without a number"),
     ],
 )
 def test_a_damaged_table_is_named_and_the_run_kept(tmp_path, text, expected):
@@ -85,18 +87,22 @@ def test_a_damaged_table_is_named_and_the_run_kept(tmp_path, text, expected):
     (folder / "eval.csv").write_text(text)
     run = runs.read(folder)
     assert run.state == "empty"
+    assert max(map(len, run.remarks)) < 300
     assert expected in "; ".join(run.remarks)
 
 
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        ({"method": "gail"}, "gail"),
+        ({"method": ""}, "method"),
+        ({"task": "\x1b[31m"}, "damaged task"),
+        ({"task": "\ud800"}, "is damaged"),
+        ({"batch_size": 10**400}, "batch_size"),
         ({"task": 3}, "task"),
         ({"seed": "0"}, "seed"),
         ({"seed": None}, "seed"),
         ({"total_frames": True}, "total_frames"),
-        ({"sinkhorn": 3}, "sinkhorn"),
+        ({"discriminator": 3}, "discriminator"),
         ({"batch_size": {"a": 1}}, "batch_size"),
         ({"demonstrations": {"num_episodes": "ten"}}, "num_episodes"),
     ],
@@ -117,22 +123,26 @@ def test_failed_runs_of_a_sweep_are_named(tmp_path):
     for folder in (early, late):
         (folder / "failed.json").write_text('{"exit_status": 3}')
     assert runs.find([tmp_path]) == [early, late]
-    assert "failed, exit status 3; its log says why" in runs.read(late).remarks
+    assert "failed, exit status 3; see its log" in runs.read(late).remarks
     with pytest.raises(runs.UnreadableError, match="the run failed, exit status 3"):
         runs.read(early)
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"config": 3}', "\xff", "[" * 10**5])
+@pytest.mark.parametrize(
+    "text", ["", "[]", '{"config": 3}', "\xff", "[" * 200_000, "9" * 10_000]
+)
 def test_what_is_no_config_is_refused(tmp_path, text):
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(runs.UnreadableError):
         runs.read(tmp_path)
 
 
-def test_fields_that_an_older_config_lacks_have_their_defaults(tmp_path):
+def test_fields_of_an_older_config_have_defaults_or_are_ignored(tmp_path):
     old = write_run(tmp_path / "old", "pdac", "walker_walk", 0, {1000: 1})
     stored = json.loads((old / "config.json").read_text())
-    del stored["config"]["pre_tanh_penalty"], stored["config"]["sinkhorn"]
+    del stored["config"]["pre_tanh_penalty"], stored["config"]["discriminator"]
+    stored["config"]["sinkhorn"] = {"epsilon": 3}  # of methods that P-DAC is not
+    stored["config"]["encoder"]["chunk_size"] = 7
     (old / "config.json").write_text(json.dumps(stored))
     new = write_run(tmp_path / "new", "pdac", "walker_walk", 1, {1000: 1})
     (group,) = groups.make_groups([runs.read(old), runs.read(new)])
@@ -146,8 +156,8 @@ def test_groups_are_seeds_of_one_thing_in_the_papers_order(found):
         ("cartpole_swingup", "P-DAC", 3),
         ("cartpole_swingup", "P-DAC, no augmentation", 1),
         ("cartpole_swingup", "P-SIL", 2),
-        ("walker_walk", "P-DAC (action_repeat 2, batch_size 256)", 2),
-        ("walker_walk", "P-DAC (action_repeat 4, batch_size 64)", 1),
+        ("walker_walk", "P-DAC", 2),
+        ("walker_walk", "P-DAC (A)", 1),
         ("walker_walk", "P-SIL", 3),
         ("walker_walk", "DrQ-v2", 1),
     ]
@@ -162,45 +172,67 @@ def test_only_settings_that_matter_split_a_group(tmp_path):
 
     pdac = [
         read("a", "pdac"),
-        read("b", "pdac", sinkhorn__epsilon=0.5, video_every_evals=0),
+        read("b", "pdac", eval_every_frames=20, video_every_evals=0),
         read("speed", "pdac", encoder__convolutions="xla", replay_on_device=True),
-        read("old", "pdac", encoder__chunk_size=0),
     ]
     assert len(groups.make_groups(pdac)) == 1
     pdac.append(read("c", "pdac", discriminator__gradient_penalty=1.0))
-    assert [group.settings for group in groups.make_groups(pdac)] == [
-        "discriminator.gradient_penalty 1",
-        "discriminator.gradient_penalty 10",
+    assert [group.label for group in groups.make_groups(pdac)] == [
+        "P-DAC",
+        "P-DAC (discriminator.gradient_penalty 1)",
     ]
-    psil = [read("d", "psil"), read("e", "psil", sinkhorn__epsilon=0.5)]
-    assert len(groups.make_groups(psil)) == 2
+    sil = [read("d", "sil"), read("e", "sil", discriminator__learning_rate=0.5)]
+    sil.append(read("f", "sil", discriminator__batch_size=64))
+    assert len(groups.make_groups(sil)) == 3
+
+
+def test_several_settings_get_a_letter_and_a_row_that_explains_it(found):
+    read = [run for run in found.values() if not isinstance(run, str)]
+    (row,) = tables.settings_table(groups.make_groups(read)).rows
+    assert row == {"variant": "P-DAC (A)", "settings": "action_repeat 4, batch_size 64"}
+
+
+def test_a_run_whose_method_is_not_installed_is_shown(tmp_path):
+    shown = []
+    for seed, size in enumerate((1, 1, 2)):
+        folder = write_run(tmp_path / str(seed), "pdac", "walker_walk", seed, {1000: 1})
+        stored = json.loads((folder / "config.json").read_text())
+        stored["config"] |= {"method": "gone.away:METHOD", "own": {"size": size}}
+        (folder / "config.json").write_text(json.dumps(stored))
+        shown.append(runs.read(folder))
+    assert "its method 'gone.away:METHOD' is not installed here" in shown[0].remarks
+    made = groups.make_groups(shown)
+    assert [(group.label, len(group.runs)) for group in made] == [
+        ("gone.away:METHOD (own.size 1)", 2),
+        ("gone.away:METHOD (own.size 2)", 1),
+    ]
 
 
 def test_what_a_reader_should_know_is_said(found):
     read = [run for run in found.values() if not isinstance(run, str)]
-    study = make_study(groups.make_groups(read))
-    text = "\n".join(summary.remarks(study, ["a/config.json is damaged"]))
+    made = groups.make_groups(read)
+    text = "\n".join(remarks.remarks(made))
     for words in (
-        "a/config.json is damaged",
         "no eval.csv: ",
         "unfinished, shown as far as they are: ",
-        "seed 0 is there 2 times and counts as often: ",
+        "walker_walk, P-DAC: 2 runs have seed 0, and each counts: ",
         "walker_walk: the runs imitate different experts",
-        "900.0 for P-DAC (action_repeat 4, batch_size 64)",
-        "without demonstrations, DrQ-v2 have no shares of an expert",
-        "walker_walk: what is compared differs also in action_repeat, batch_size",
+        "900.0 for P-DAC (A)",
+        "no expert's return is known for DrQ-v2, so no share of it is shown",
+        "walker_walk: compared runs also differ in action_repeat, batch_size",
         "1 on cartpole_swingup",
     ):
         assert words in text
-    rows = {tuple(row[:2]): row[2:] for row in summary.seed_table(study, 4).rows}
-    assert rows["cartpole_swingup", "P-DAC"] == ("0-2", 3, 0, 0, "3")
-    assert rows["walker_walk", "P-SIL"] == ("0-2", 0, 1, 2, "3")
+    rows = [tuple(row.values()) for row in tables.seed_table(made, 4).rows]
+    assert ("cartpole_swingup", "P-DAC", "0-2", 3, 0, 0, "3") in rows
+    assert ("walker_walk", "P-SIL", "0-2", 0, 1, 2, "3") in rows
+    assert "missing" not in tables.seed_table(made, None).rows[0]
 
 
 def test_looks_are_one_colour_for_a_method_and_differ_within_it(found):
     read = [run for run in found.values() if not isinstance(run, str)]
-    study = make_study(groups.make_groups(read))
-    assert study.looks["P-DAC"].colour == "#0072b2"
-    assert study.looks["P-SIL"].colour == "#d55e00"
-    pdac = [look for label, look in study.looks.items() if label.startswith("P-DAC")]
-    assert len(set(pdac)) == len(pdac) == 4
+    looks = {group.label: group.look for group in groups.make_groups(read)}
+    assert looks["P-DAC"].colour == "#0072b2"
+    assert looks["P-SIL"].colour == "#d55e00"
+    pdac = [look for label, look in looks.items() if label.startswith("P-DAC")]
+    assert len(set(pdac)) == len(pdac) == 3

@@ -1,4 +1,4 @@
-"""DAC on pixels: sign, alignment, rewards made anew, and eyes of its own."""
+"""DAC on pixels: sign, alignment, relabelling, and its separate encoder."""
 
 import functools
 
@@ -8,25 +8,24 @@ import numpy as np
 import pytest
 
 from jaxil.learner.rewarder import AgentView
-from jaxil.maths.types import Episode, ExpertBatch, Window
-from jaxil.rewarders.dac import make_dac_rewarder
-from tests.tiny_agent import NETWORKS, NOBODY, SIDE, make_spec
+from jaxil.maths.types import Batch, ExpertBatch, Window
+from jaxil.rewarders import dac
+from tests.tiny_agent import NOBODY, SIDE, make_agent, make_episode, make_spec
 
 STACK, BATCH = 2, 8
 SPEC = make_spec(expert_steps=4, frame_stack=STACK)
 SHAPE = SPEC.observation_shape
+NO_BATCH = Batch(None, None, None, None, None)
 
 
 @functools.cache
 def make_rewarder():
-    rewarder = make_dac_rewarder(
-        NETWORKS,
-        feature_dim=5,
+    rewarder = dac.make_rewarder(
+        make_agent(frame_stack=STACK),
         hidden_dim=16,
         learning_rate=3e-3,
-        penalty_weight=1.0,
+        gradient_penalty=1.0,
         batch_size=BATCH,
-        frame_stack=STACK,
     )
     return rewarder._replace(update=jax.jit(rewarder.update))
 
@@ -34,10 +33,10 @@ def make_rewarder():
 def relabel(state, window):
     rewarder = make_rewarder()
     assert rewarder.relabel is not None
-    return rewarder.relabel(state, NOBODY, window)
+    return rewarder.relabel(state, NOBODY, NO_BATCH._replace(window=window))
 
 
-def draw(seed, count, low=0, high=256, shape=SHAPE):
+def sample(seed, count, low=0, high=256, shape=SHAPE):
     rng = np.random.default_rng(seed)
     pixels = rng.integers(low, high, (count, *shape), dtype=np.uint8)
     return pixels, rng.uniform(-1, 1, (count, 2)).astype(np.float32)
@@ -68,7 +67,7 @@ def learn(expert, agent, steps=200):
 
 @pytest.mark.parametrize("told_by", ["pixels", "actions"])
 def test_expert_above_zero_above_agent_after_learning(told_by):
-    expert, agent = draw(0, 64, 0, 100), draw(1, 64, 156, 256)
+    expert, agent = sample(0, 64, 0, 100), sample(1, 64, 156, 256)
     if told_by == "actions":
         expert = (agent[0], np.full((64, 2), 0.9, np.float32))
         agent = (agent[0], np.full((64, 2), -0.9, np.float32))
@@ -86,30 +85,29 @@ def test_expert_above_zero_above_agent_after_learning(told_by):
 def test_reward_t_judges_observation_and_action_t():
     rewarder = make_rewarder()
     state = rewarder.init(jax.random.key(0), SPEC, NOBODY)
-    frames, actions = draw(2, 6, shape=(SIDE, SIDE, 3))
-    before, _ = rewarder.rewards(
-        state, NOBODY, Episode(frames, actions[:5], np.zeros(5)), None
-    )
+    frames, actions = sample(2, 6, shape=(SIDE, SIDE, 3))
+
+    def rewards(frames, actions):
+        episode = make_episode(frames, actions)
+        return np.asarray(rewarder.rewards(state, NOBODY, episode, None))
+
+    before = rewards(frames, actions[:5])
     assert before.shape == (5,)
     for t in range(5):
         changed = actions[:5].copy()
         changed[t] = -changed[t]
-        after, _ = rewarder.rewards(
-            state, NOBODY, Episode(frames, changed, np.zeros(5)), None
-        )
-        assert np.flatnonzero(np.asarray(after != before)).tolist() == [t]
+        after = rewards(frames, changed)
+        assert np.flatnonzero(after != before).tolist() == [t]
     other = frames.copy()
     other[5] = 255 - other[5]  # what the last action led to
-    after, _ = rewarder.rewards(
-        state, NOBODY, Episode(other, actions[:5], np.zeros(5)), None
-    )
+    after = rewards(other, actions[:5])
     np.testing.assert_array_equal(after, before)
 
 
-def test_a_window_is_rewarded_as_its_transitions_are():
+def test_a_window_is_rewarded_as_its_transitions_are_one_by_one():
     rewarder = make_rewarder()
     state = rewarder.init(jax.random.key(0), SPEC, NOBODY)
-    pixels, actions = draw(3, 6)
+    pixels, actions = sample(3, 6)
     window = Window(
         pixels.reshape(2, 3, *SHAPE), actions.reshape(2, 3, 2), np.ones((2, 3))
     )
@@ -122,7 +120,7 @@ def test_a_window_is_rewarded_as_its_transitions_are():
 def test_the_penalty_is_on_pixels_in_zero_to_one_and_actions():
     # A step on batches that are one and the same leaves nothing but the penalty, and
     # lowers it.
-    same = draw(4, BATCH)
+    same = sample(4, BATCH)
     _, first = learn((same[0], same[1]), same, steps=1)
     _, last = learn((same[0], same[1]), same, steps=60)
     assert last["discriminator/penalty"] < 0.5 * first["discriminator/penalty"]

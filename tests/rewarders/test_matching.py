@@ -1,4 +1,4 @@
-"""Which moments are paired: by hand, by SciPy, and in episodes of unlike length."""
+"""Which moments are paired: by hand, by SciPy, and in episodes of different lengths."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,12 +15,12 @@ def matching(cost="euclidean", alignment="time"):
     )
 
 
-def draw(seed, *shape):
+def random(seed, *shape):
     return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
 
 
 def test_euclidean_cost_is_scipys():
-    x, y = draw(0, 7, 5), draw(1, 4, 5)
+    x, y = random(0, 7, 5), random(1, 4, 5)
     expected = distance.cdist(x, y)
     np.testing.assert_allclose(transport.euclidean_cost(x, y), expected, rtol=1e-4)
 
@@ -35,7 +35,7 @@ def test_at_the_same_time_by_hand():
 
 
 def test_only_transport_forgives_another_order():
-    expert = draw(0, 1, 6, 4)
+    expert = random(0, 1, 6, 4)
     backwards = expert[0, ::-1]
     lengths = jnp.array([6])
     aligned = matching("cosine", "transport").rewards(backwards, expert, lengths)
@@ -46,7 +46,7 @@ def test_only_transport_forgives_another_order():
 
 @pytest.mark.parametrize("alignment", ["time", "transport"])
 def test_the_closest_demonstration_counts(alignment):
-    near, far = draw(0, 6, 4), 5.0 + draw(1, 6, 4)
+    near, far = random(0, 6, 4), 5.0 + random(1, 6, 4)
     experts = jnp.stack([far, near])
     chosen = matching("euclidean", alignment)
     rewards = chosen.rewards(near, experts, jnp.array([6, 6]))
@@ -57,7 +57,7 @@ def test_the_closest_demonstration_counts(alignment):
 
 @pytest.mark.parametrize("alignment", ["time", "transport"])
 def test_rows_carry_their_share_and_padding_carries_nothing(alignment):
-    agent, experts = draw(0, 5, 3), draw(1, 2, 7, 3)
+    agent, experts = random(0, 5, 3), random(1, 2, 7, 3)
     plan = matching("cosine", alignment).closest_plan(agent, experts, jnp.array([4, 4]))
     np.testing.assert_allclose(jnp.sum(plan, axis=1), np.full(5, 0.2), rtol=1e-5)
     assert float(jnp.max(plan[:, 4:])) < 1e-6

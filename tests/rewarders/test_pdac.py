@@ -10,11 +10,19 @@ import optax
 import pytest
 
 from jaxil.learner.rewarder import AgentView
-from jaxil.maths.types import Episode, ExpertBatch
+from jaxil.maths.types import ExpertBatch
 from jaxil.networks.agent import apply, critic_features
 from jaxil.networks.discriminator import Discriminator
-from jaxil.rewarders.pdac import make_adversarial_rewarder
-from tests.tiny_agent import NETWORKS, make_params, make_spec, random_frames
+from jaxil.rewarders import pdac
+from tests.tiny_agent import (
+    NETWORKS,
+    make_agent,
+    make_episode,
+    make_params,
+    make_spec,
+    random_actions,
+    random_frames,
+)
 
 STEPS, BATCH = 5, 8
 SPEC = make_spec(expert_steps=4)
@@ -22,24 +30,17 @@ SPEC = make_spec(expert_steps=4)
 
 @functools.cache
 def make_rewarder(frame_stack=1, sees_actions=False, shift_padding=0):
-    rewarder = make_adversarial_rewarder(
-        NETWORKS,
+    rewarder = pdac.make_rewarder(
+        make_agent(frame_stack, shift_padding),
         hidden_dim=16,
         learning_rate=3e-3,
-        penalty_weight=10.0,
+        gradient_penalty=10.0,
         batch_size=BATCH,
         sees_actions=sees_actions,
-        shift_padding=shift_padding,
-        frame_stack=frame_stack,
     )
     return rewarder._replace(
         rewards=jax.jit(rewarder.rewards), update=jax.jit(rewarder.update)
     )
-
-
-def random_actions(seed, count):
-    rng = np.random.default_rng(seed)
-    return rng.uniform(-1, 1, (count, 2)).astype(np.float32)
 
 
 def make_view(params, frames, actions=None):
@@ -54,10 +55,8 @@ def make_view(params, frames, actions=None):
 def rewards_of(rewarder, params, frames, actions=None, seed=0):
     state = rewarder.init(jax.random.key(seed), SPEC, params)
     actions = random_actions(0, len(frames) - 1) if actions is None else actions
-    episode = Episode(frames, actions, np.zeros(len(actions)))
-    rewards, after = rewarder.rewards(state, params, episode, None)
-    jax.tree.map(np.testing.assert_array_equal, after, state)
-    return np.asarray(rewards)
+    episode = make_episode(frames, actions)
+    return np.asarray(rewarder.rewards(state, params, episode, None))
 
 
 # Rewards -----------------------------------------------------------------------
@@ -85,6 +84,15 @@ def test_a_frame_is_seen_for_as_long_as_it_is_stacked(special):
     # It is in o_special, o_special+1 and o_special+2; reward t judges o_t+1.
     expected = [t for t in range(STEPS) if special <= t + 1 <= special + 2]
     np.testing.assert_array_equal(np.flatnonzero(changed), expected)
+
+
+def test_episodes_change_no_state_but_updates_change_every_reward():
+    rewarder, params = make_rewarder(), make_params(0)
+    state = rewarder.init(jax.random.key(0), SPEC, params)
+    episode = make_episode(random_frames(0, STEPS + 1))
+    assert rewarder.observe(state, params, episode, None) is state
+    assert rewarder.rewards_changed is not None
+    assert rewarder.rewards_changed(state)
 
 
 @pytest.mark.parametrize("special", [0, 2, STEPS])
@@ -155,14 +163,12 @@ def test_expert_above_zero_above_agent_after_learning():
             state, metrics = rewarder.update(
                 state,
                 params,
-                AgentView(*(values[ours] for values in view)),
+                jax.tree.map(lambda values, ours=ours: values[ours], view),
                 ExpertBatch(expert[theirs], actions[theirs]),
                 jax.random.fold_in(jax.random.key(1), number),
             )
         expert_rewards, agent_rewards = (
-            rewarder.rewards(
-                state, params, Episode(frames, actions[1:], np.zeros(63)), None
-            )[0]
+            rewarder.rewards(state, params, make_episode(frames, actions[1:]), None)
             for frames in (expert, agent)
         )
         assert np.mean(expert_rewards) > 0.1

@@ -9,44 +9,59 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from jaxil.maths import augmentation, transport
-from jaxil.maths.types import ExpertEpisodes
+from jaxil.maths import stacking, transport
 from jaxil.networks.agent import actor_features
+from jaxil.rewarders import psil
 from jaxil.rewarders.matching import closest_rewards, make_matching
-from jaxil.rewarders.psil import make_sinkhorn_rewarder
 from tests.tiny_agent import (
     NETWORKS,
     SIDE,
+    make_agent,
     make_episode,
+    make_experts,
     make_params,
+    make_play,
     make_spec,
     random_frames,
 )
 
 STEPS, EXPERT_STEPS, K = 6, 5, 3
 SPEC = make_spec(num_demonstrations=K, expert_steps=EXPERT_STEPS)
+EXPERTS = make_experts(random_frames(50, K, EXPERT_STEPS + 1))
 
 
 @functools.cache
-def make_rewarder(frame_stack=1, target_update_steps=20):
-    rewarder = make_sinkhorn_rewarder(
-        NETWORKS,
-        matching=make_matching(
-            cost="cosine", alignment="transport", epsilon=0.01, num_iterations=50
-        ),
-        target_update_steps=target_update_steps,
+def make_rewarder(frame_stack=1, alignment="transport"):
+    return psil.make_rewarder(
+        make_agent(frame_stack),
+        cost="cosine",
+        alignment=alignment,
+        epsilon=0.01,
+        num_iterations=50,
+        target_update_steps=20,
         return_scale=10.0,
-        frame_stack=frame_stack,
     )
-    return rewarder._replace(rewards=jax.jit(rewarder.rewards))
 
 
-def make_experts(seed=50):
-    return ExpertEpisodes(
-        random_frames(seed, K, EXPERT_STEPS + 1),
-        np.full(K, EXPERT_STEPS + 1),
-        np.zeros((K, EXPERT_STEPS, 2)),
-    )
+@functools.cache
+def compiled(frame_stack):
+    return make_play(make_rewarder(frame_stack))
+
+
+def start(params, spec=SPEC):
+    return make_rewarder().init(jax.random.key(0), spec, params)
+
+
+def play(state, params, frames, experts=EXPERTS, frame_stack=1):
+    """Ends an episode; returns its rewards and the state after it."""
+    episode = make_episode(frames)
+    rewards, state = compiled(frame_stack)(state, params, episode, experts)
+    return np.asarray(rewards), state
+
+
+def first_rewards(params, frames, experts=EXPERTS, frame_stack=1, spec=SPEC):
+    """Rewards of an episode that is a run's first."""
+    return play(start(params, spec), params, frames, experts, frame_stack)[0]
 
 
 @functools.partial(jax.jit, static_argnames=("epsilon", "num_iterations"))
@@ -60,19 +75,6 @@ def solve(costs, *, epsilon, num_iterations):
         num_iterations=num_iterations,
     )
     return closest_rewards(costs, jax.vmap(matching.plan)(costs, masses))
-
-
-def start(rewarder, params):
-    return rewarder.init(jax.random.key(0), SPEC, params)
-
-
-def first_rewards(params, frames, experts=None, frame_stack=1):
-    """Rewards of an episode that is a run's first."""
-    rewarder = make_rewarder(frame_stack)
-    rewards, _ = rewarder.rewards(
-        start(rewarder, params), params, make_episode(frames), experts or make_experts()
-    )
-    return np.asarray(rewards)
 
 
 # The transport -----------------------------------------------------------------
@@ -116,18 +118,10 @@ def test_demonstrations_are_compared_by_cost_and_not_by_entropy():
 
 
 def test_a_demonstration_played_back_is_found():
-    experts = make_experts()
     params = make_params(0)
-    rewarder = make_rewarder()
-    _, state = rewarder.rewards(
-        start(rewarder, params),
-        params,
-        make_episode(random_frames(1, STEPS + 1)),
-        experts,
-    )
-    for k in range(K):
-        frames = np.asarray(experts.frames[k])
-        rewards, _ = rewarder.rewards(state, params, make_episode(frames), experts)
+    _, state = play(start(params), params, random_frames(1, STEPS + 1))
+    for frames in EXPERTS.frames:
+        rewards, _ = play(state, params, np.asarray(frames))
         np.testing.assert_allclose(rewards, 0.0, atol=1e-2 * state.scale)
 
 
@@ -138,34 +132,28 @@ def test_a_demonstration_played_back_is_found():
 def test_reward_t_is_of_observation_t_plus_1(special):
     # All frames are those of the expert but one, which alone has to be carried far.
     plain = random_frames(1, 1)[0]
-    experts = ExpertEpisodes(
-        np.broadcast_to(plain, (K, EXPERT_STEPS + 1, *plain.shape)),
-        np.full(K, EXPERT_STEPS + 1),
-        np.zeros((K, EXPERT_STEPS, 2)),
-    )
+    experts = make_experts(np.broadcast_to(plain, (K, EXPERT_STEPS + 1, *plain.shape)))
     # A first episode sets the scale, so that this one's is not taken up with it.
-    rewarder, params = make_rewarder(), make_params(0)
-    first = make_episode(random_frames(1, STEPS + 1))
-    _, state = rewarder.rewards(start(rewarder, params), params, first, experts)
+    params = make_params(0)
+    _, state = play(start(params), params, random_frames(1, STEPS + 1), experts)
     frames = np.repeat(plain[None], STEPS + 1, axis=0)
     frames[special] = random_frames(2, 1)[0]
-    rewards, _ = rewarder.rewards(state, params, make_episode(frames), experts)
-    below = np.flatnonzero(np.asarray(rewards) < -1e-3)
+    rewards, _ = play(state, params, frames, experts)
+    below = np.flatnonzero(rewards < -1e-3)
     expected = [] if special == 0 else [special - 1]  # nothing led to o_0
     np.testing.assert_array_equal(below, expected)
 
 
 @pytest.mark.parametrize("frame_stack", [1, 2])
 def test_rewards_step_by_step(frame_stack):
-    params, experts = make_params(0, frame_stack), make_experts()
-    frames = random_frames(1, STEPS + 1)
+    params, frames = make_params(0, frame_stack), random_frames(1, STEPS + 1)
 
     def features(frames):
-        stacks = augmentation.stack_frames(frames, frame_stack=frame_stack)
+        stacks = stacking.stack_frames(frames, frame_stack=frame_stack)
         return actor_features(NETWORKS, params.encoder, params.actor, stacks)
 
     candidates = []
-    for demonstration in experts.frames:
+    for demonstration in EXPERTS.frames:
         cost = transport.cosine_cost(
             features(jnp.asarray(frames)), features(jnp.asarray(demonstration))
         )
@@ -173,37 +161,23 @@ def test_rewards_step_by_step(frame_stack):
         plan = transport.sinkhorn_plan(cost, mass, epsilon=0.01, num_iterations=50)
         candidates.append(-np.sum(np.asarray(cost) * np.asarray(plan), axis=1))
     best = max(candidates, key=np.sum)[1:]
-    rewards = first_rewards(params, frames, experts, frame_stack)
+    rewards = first_rewards(params, frames, EXPERTS, frame_stack)
     assert len(rewards) == STEPS
     np.testing.assert_allclose(rewards, best * 10.0 / -np.sum(best), rtol=1e-3)
 
 
-def test_what_fills_a_short_demonstration_up_counts_for_nothing():
-    # The same demonstrations, once alone and once filled up to twice their length with
+def test_the_padding_of_a_short_demonstration_counts_for_nothing():
+    # The same demonstrations, once alone and once padded to twice their length with
     # frames that would be far cheaper to reach: the agent's own.
-    params, experts = make_params(0), make_experts()
-    frames = random_frames(1, STEPS + 1)
-    filled = np.concatenate([experts.frames, experts.frames], axis=1)
-    filled[:, EXPERT_STEPS + 1 :] = frames[0]
-    longer = experts._replace(frames=filled)
-    spec = SPEC._replace(expert_steps=filled.shape[1] - 1)
-    rewarder = make_rewarder()
-    rewards, _ = rewarder.rewards(
-        rewarder.init(jax.random.key(0), spec, params),
-        params,
-        make_episode(frames),
-        longer,
-    )
-    np.testing.assert_allclose(
-        rewards, first_rewards(params, frames, experts), rtol=1e-4
-    )
-    with_filling = longer._replace(num_frames=np.full(K, filled.shape[1]))
-    other, _ = rewarder.rewards(
-        rewarder.init(jax.random.key(0), spec, params),
-        params,
-        make_episode(frames),
-        with_filling,
-    )
+    params, frames = make_params(0), random_frames(1, STEPS + 1)
+    padded = np.concatenate([EXPERTS.frames, EXPERTS.frames], axis=1)
+    padded[:, EXPERT_STEPS + 1 :] = frames[0]
+    spec = SPEC._replace(expert_steps=padded.shape[1] - 1)
+    longer = make_experts(padded)
+    short = longer._replace(num_frames=EXPERTS.num_frames)
+    rewards = first_rewards(params, frames, short, spec=spec)
+    np.testing.assert_allclose(rewards, first_rewards(params, frames), rtol=1e-4)
+    other = first_rewards(params, frames, longer, spec=spec)
     assert np.abs(other - rewards).max() > 1e-2
 
 
@@ -229,37 +203,33 @@ def test_reads_the_actors_trunk_and_nothing_of_the_critic():
 
 
 def test_the_first_episode_sets_the_scale_for_good():
-    rewarder, params, experts = make_rewarder(), make_params(0), make_experts()
-    state = start(rewarder, params)
-    assert rewarder.summary(state) == {"sinkhorn/scale": 0.0}
-    first = make_episode(random_frames(1, STEPS + 1))
-    rewards, state = rewarder.rewards(state, params, first, experts)
+    summary, params = make_rewarder().summary, make_params(0)
+    state, first = start(params), random_frames(1, STEPS + 1)
+    assert summary(state) == {"sinkhorn/scale": 0.0}
+    rewards, state = play(state, params, first)
     np.testing.assert_allclose(np.sum(rewards), -10.0, rtol=1e-5)
     scale = state.scale
     assert scale > 0.0
     # An easier episode: half of it is a demonstration.
     frames = random_frames(2, STEPS + 1)
-    frames[:4] = experts.frames[0][:4]
-    rewards, state = rewarder.rewards(state, params, make_episode(frames), experts)
+    frames[:4] = EXPERTS.frames[0][:4]
+    rewards, state = play(state, params, frames)
     assert state.scale == scale
     assert -8.0 < np.sum(rewards) < 0.0
     # The first episode over again returns what it did.
-    rewards, state = rewarder.rewards(state, params, first, experts)
+    rewards, state = play(state, params, first)
     np.testing.assert_allclose(np.sum(rewards), -10.0, rtol=1e-5)
     # A copy of other networks leaves it as it is, too.
-    rewarder.rewards(
-        state.replace(steps_since_copy=jnp.asarray(99)), make_params(1), first, experts
-    )
-    assert rewarder.summary(state)["sinkhorn/scale"] == scale
+    due = state.replace(steps_since_copy=jnp.asarray(99))
+    _, copied = play(due, make_params(1), first)
+    assert summary(copied)["sinkhorn/scale"] == scale
 
 
 def test_a_perfect_first_episode_leaves_the_scale_finite():
-    rewarder, params, experts = make_rewarder(), make_params(0), make_experts()
     black = np.zeros((STEPS + 1, SIDE, SIDE, 3), np.uint8)
-    experts = experts._replace(frames=np.zeros_like(experts.frames))
-    rewards, state = rewarder.rewards(
-        start(rewarder, params), params, make_episode(black), experts
-    )
+    experts = EXPERTS._replace(frames=np.zeros_like(EXPERTS.frames))
+    params = make_params(0)
+    rewards, state = play(start(params), params, black, experts)
     assert np.all(np.isfinite(rewards))
     assert np.isfinite(state.scale)
 
@@ -275,30 +245,30 @@ def test_a_perfect_first_episode_leaves_the_scale_finite():
     ],
 )
 def test_targets_are_copied_when_due(lengths, copies):
-    rewarder = make_rewarder()
-    experts = make_experts()
-    base = make_params(0)
-    state = start(rewarder, base)
+    # Which moments are paired plays no part: time compiles sooner than transport.
+    rewarder, base = make_rewarder(alignment="time"), make_params(0)
+    assert rewarder.rewards_changed is not None
+    observe = jax.jit(rewarder.observe)
+    state, held = start(base), None
     jax.tree.map(np.testing.assert_array_equal, state.target_actor, base.actor)
-    held = None
     for number, (length, copied) in enumerate(zip(lengths, copies, strict=True)):
         # Live networks change with every episode.
         live = jax.tree.map(lambda leaf, n=number: leaf * (1.0 + 0.1 * n), base)
         episode = make_episode(random_frames(number, length + 1))
-        _, state = rewarder.rewards(state, live, episode, experts)
+        state = observe(state, live, episode, EXPERTS)
+        assert bool(rewarder.rewards_changed(state)) is copied
         held = live if copied else held
         assert held is not None
         jax.tree.map(np.testing.assert_array_equal, state.target_encoder, held.encoder)
         jax.tree.map(np.testing.assert_array_equal, state.target_actor, held.actor)
         features = actor_features(
-            NETWORKS, held.encoder, held.actor, jnp.asarray(experts.frames[1])
+            NETWORKS, held.encoder, held.actor, jnp.asarray(EXPERTS.frames[1])
         )
         np.testing.assert_allclose(state.expert_features[1], features, atol=1e-5)
 
 
 def test_rewards_do_not_follow_the_live_networks_between_copies():
-    rewarder, params, experts = make_rewarder(), make_params(0), make_experts()
-    episode = make_episode(random_frames(1, STEPS + 1))
-    first, state = rewarder.rewards(start(rewarder, params), params, episode, experts)
-    second, _ = rewarder.rewards(state, make_params(1), episode, experts)
+    params, frames = make_params(0), random_frames(1, STEPS + 1)
+    first, state = play(start(params), params, frames)
+    second, _ = play(state, make_params(1), frames)
     np.testing.assert_array_equal(first, second)

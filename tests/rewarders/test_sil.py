@@ -7,37 +7,40 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxil.learner.rewarder import AgentView
-from jaxil.maths.types import ExpertBatch, ExpertEpisodes
+from jaxil.maths.types import ExpertBatch
+from jaxil.rewarders import sil
 from jaxil.rewarders.matching import make_matching
-from jaxil.rewarders.sil import batch_distance, make_sil_rewarder
-from tests.tiny_agent import NETWORKS, NOBODY, make_episode, make_spec, random_frames
+from tests.tiny_agent import (
+    NOBODY,
+    make_agent,
+    make_episode,
+    make_experts,
+    make_play,
+    make_spec,
+    random_frames,
+)
 
 STEPS, BATCH = 5, 8
 SPEC = make_spec(expert_steps=STEPS)
-MATCHING = make_matching(
-    cost="cosine", alignment="transport", epsilon=0.05, num_iterations=200
-)
+EXPERTS = make_experts(random_frames(50, 2, STEPS + 1))
 
 
 @functools.cache
 def make_rewarder():
-    rewarder = make_sil_rewarder(
-        NETWORKS,
-        matching=MATCHING,
-        feature_dim=5,
+    rewarder = sil.make_rewarder(
+        make_agent(),
+        cost="cosine",
+        alignment="transport",
+        epsilon=0.05,
+        num_iterations=200,
+        return_scale=10.0,
         learning_rate=3e-3,
         batch_size=BATCH,
-        return_scale=10.0,
-        frame_stack=1,
     )
     return rewarder._replace(
-        update=jax.jit(rewarder.update), rewards=jax.jit(rewarder.rewards)
+        update=jax.jit(rewarder.update),
+        rewards=jax.jit(rewarder.rewards),
     )
-
-
-def make_experts():
-    frames = random_frames(50, 2, STEPS + 1)
-    return ExpertEpisodes(frames, np.full(2, STEPS + 1), np.zeros((2, 0, 0)))
 
 
 def start():
@@ -68,19 +71,15 @@ def test_the_embedding_learns_to_tell_apart():
 
 
 def test_rewards_fall_where_the_embedding_has_learned():
-    frames, experts = random_frames(2, STEPS + 1), make_experts()
+    episode = make_episode(random_frames(2, STEPS + 1))
     state = start().replace(scale=jnp.ones(()))
 
     def total(state):
-        return float(
-            jnp.sum(
-                make_rewarder().rewards(state, NOBODY, make_episode(frames), experts)[0]
-            )
-        )
+        return float(jnp.sum(make_rewarder().rewards(state, NOBODY, episode, EXPERTS)))
 
     before = total(state)
-    agent = np.resize(frames, (BATCH, *frames.shape[1:]))
-    expert = np.resize(experts.frames.reshape(-1, *frames.shape[1:]), agent.shape)
+    agent = np.resize(episode.frames, (BATCH, *episode.frames.shape[1:]))
+    expert = np.resize(EXPERTS.frames.reshape(-1, *agent.shape[1:]), agent.shape)
     after, _ = climb(state, agent, expert, 40)
     assert total(after) < before
 
@@ -93,11 +92,11 @@ def test_the_gradient_is_that_of_the_distance():
     tight = make_matching(
         cost="cosine", alignment="transport", epsilon=0.005, num_iterations=2000
     )
-    gradient = jax.grad(lambda x: batch_distance(tight, x, expert))(agent)
+    gradient = jax.grad(lambda x: sil.batch_distance(tight, x, expert))(agent)
     numeric = np.zeros(agent.shape)
     for index in np.ndindex(*agent.shape):
         step = jnp.zeros_like(agent).at[index].set(1e-2)
-        up, down = (batch_distance(tight, agent + s, expert) for s in (step, -step))
+        up, down = (sil.batch_distance(tight, agent + s, expert) for s in (step, -step))
         numeric[index] = (up - down) / 2e-2
     cosine = np.sum(gradient * numeric) / (
         np.linalg.norm(gradient) * np.linalg.norm(numeric)
@@ -106,23 +105,20 @@ def test_the_gradient_is_that_of_the_distance():
 
 
 def test_the_first_episode_returns_minus_ten_and_the_scale_stays():
-    rewarder, experts = make_rewarder(), make_experts()
-    rewards, state = rewarder.rewards(
-        start(), NOBODY, make_episode(random_frames(3, STEPS + 1)), experts
-    )
+    rewarder = make_rewarder()
+    first, other = (make_episode(random_frames(n, STEPS + 1)) for n in (3, 4))
+    play = make_play(rewarder)
+    rewards, state = play(start(), NOBODY, first, EXPERTS)
     assert rewards.shape == (STEPS,)
     np.testing.assert_allclose(jnp.sum(rewards), -10.0, rtol=1e-4)
-    other, later = rewarder.rewards(
-        state, NOBODY, make_episode(random_frames(4, STEPS + 1)), experts
-    )
+    rewards, later = play(state, NOBODY, other, EXPERTS)
     assert later.scale == state.scale
-    assert not np.isclose(jnp.sum(other), -10.0)
+    assert not np.isclose(jnp.sum(rewards), -10.0)
 
 
 def test_the_plan_matches_a_demonstration_with_itself():
-    experts = make_experts()
     make_plan = make_rewarder().plan
     assert make_plan is not None
-    plan = make_plan(start(), NOBODY, make_episode(experts.frames[1]), experts)
+    plan = make_plan(start(), NOBODY, make_episode(EXPERTS.frames[1]), EXPERTS)
     assert plan.shape == (STEPS + 1, STEPS + 1)
     assert np.all(np.argmax(plan, axis=1) == np.arange(STEPS + 1))

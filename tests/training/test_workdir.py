@@ -29,7 +29,7 @@ def test_a_field_that_is_newer_than_the_run_has_its_default(tmp_path):
     assert "sinkhorn.alignment: 'transport' there, 'time' here" in str(fault)
 
 
-def test_a_run_goes_on_longer_or_with_other_convolutions(tmp_path):
+def test_a_run_may_be_resumed_for_longer_or_with_other_convolutions(tmp_path):
     config = jaxil_config.default_config("psil", "walker_walk")
     write(tmp_path, config.to_dict())
     config.encoder.convolutions = "xla"
@@ -38,7 +38,7 @@ def test_a_run_goes_on_longer_or_with_other_convolutions(tmp_path):
     assert workdir.problems(tmp_path, config) == []
 
 
-def test_a_run_goes_on_that_has_a_field_of_former_times(tmp_path):
+def test_a_former_field_is_left_out(tmp_path):
     config = jaxil_config.default_config("psil", "walker_walk")
     old = config.to_dict()
     old["encoder"]["chunk_size"] = 64

@@ -1,1 +1,1 @@
-"""Other people's demonstration files, one module for each format."""
+"""Readers of pixel demonstrations, one module per format."""

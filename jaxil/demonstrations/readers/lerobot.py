@@ -1,8 +1,8 @@
 """LeRobot datasets of version 3: one camera, actions and rewards.
 
-LeRobot stores with frame t the action that was taken there, and no frame that shows
-what the last one led to: that action is dropped, and an episode of L frames has L - 1
-steps. `next.reward`, or else `reward`, is what arrived after the action.
+LeRobot stores action t with frame t, but no frame after the last action. That action is
+dropped: an episode of L frames has L - 1 steps. The reward of action t is
+`next.reward`, or else `reward`.
 
 Source of the format: huggingface/lerobot, src/lerobot/datasets.
 """
@@ -31,30 +31,23 @@ from jaxil.files.untrusted import require_regular
 _INFO = "meta/info.json"
 _MAX_EPISODES = 1_000_000
 _MAX_FPS = 1e6
-_MAX_RATE_ERROR = 0.001  # of a video's frames per second against the dataset's
+_MAX_RATE_ERROR = 0.001  # relative, of a video's frame rate
 
 
 class _Dataset(NamedTuple):
-    """What meta/info.json says.
-
-    Attributes:
-      camera: the name of its only camera.
-      is_video: whether its pictures are in videos, or beside the actions.
-      columns: of "actions" and "rewards", those that there are.
-      paths: templates of the paths of "data" and "video".
-    """
+    """The content of meta/info.json."""
 
     root: pathlib.Path
     fps: float
     num_episodes: int
-    camera: str
-    is_video: bool
-    columns: dict[str, str]
-    paths: dict[str, Any]
+    camera: str  # name of the only camera
+    is_video: bool  # whether its images are in videos, not in the Parquet files
+    columns: dict[str, str]  # of "actions" and "rewards", if present
+    paths: dict[str, Any]  # path templates of "data" and "video"
 
 
-class _Episode(NamedTuple):
-    """Where an episode is; it begins `start_seconds` after its video does."""
+class _Location(NamedTuple):
+    """Where an episode is stored; `start_seconds` is its start in the video."""
 
     index: int
     length_frames: int
@@ -64,15 +57,12 @@ class _Episode(NamedTuple):
 
 
 def recognises(path: pathlib.Path) -> bool:
-    """Tells whether this is the folder of a LeRobot dataset."""
+    """Returns whether this is the folder of a LeRobot dataset."""
     return b'"codebase_version"' in first_bytes(path / _INFO, 4096)
 
 
 def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
-    """Reads a dataset that has exactly one camera; see `recording`.
-
-    Nothing outside of its folder is opened.
-    """
+    """Reads a dataset of exactly one camera; opens no file outside its folder."""
     dataset = _read_info(path)
     try:
         import pyarrow  # noqa: F401
@@ -81,19 +71,19 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
     episodes = _find_episodes(dataset)
     notes = ()
     if "actions" not in dataset.columns:
-        notes = ("Its actions are no real numbers, and not read.",)
+        notes = ("Its actions are ignored, because they are not real numbers.",)
     fps = dataset.fps
     yield Recording(
         "LeRobot dataset", len(episodes), frames_per_second=fps, notes=notes
     )
     rows = _rows(dataset, episodes, options)
-    videos_ = _video_frames(dataset, episodes, options) if dataset.is_video else None
+    shots = _video_frames(dataset, episodes, options) if dataset.is_video else None
     for episode in episodes:
         values = next(rows)
-        if videos_ is None:
+        if shots is None:
             yield PixelEpisode(stored_size=None, **values)
             continue
-        while (shown := next(videos_)) is None:
+        while (shown := next(shots)) is None:
             yield None
         if len(shown.frames) != episode.length_frames:
             raise FormatError(
@@ -104,14 +94,12 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
 
 
 def _read_info(root: pathlib.Path) -> _Dataset:
-    """Returns what the dataset says of itself, checked."""
+    """Reads and checks meta/info.json."""
     info = read_json(_inside(root, _INFO))
     version, features = info.get("codebase_version"), info.get("features")
     if not str(version).startswith("v3."):
-        raise FormatError(
-            f"has codebase_version {version!r:.50}; only v3 can be read, to which "
-            "LeRobot converts older ones"
-        )
+        what = f"has codebase_version {version!r:.50}"
+        raise FormatError(f"{what}, not v3, to which LeRobot converts older ones")
     for name, kind, most in (
         ("fps", int | float, _MAX_FPS),
         ("total_episodes", int, _MAX_EPISODES),
@@ -135,15 +123,14 @@ def _read_info(root: pathlib.Path) -> _Dataset:
     columns = {}
     if kinds.get("action") in ("float32", "float64"):
         columns["actions"] = "action"
-    for name in ("reward", "next.reward"):  # the last one that is there counts
+    for name in ("reward", "next.reward"):  # the latter if both exist
         if name in kinds:
             columns["rewards"] = name
     fps, num_episodes = float(info["fps"]), info["total_episodes"]
     return _Dataset(root, fps, num_episodes, cameras[0], is_video, columns, paths)
 
 
-def _find_episodes(dataset: _Dataset) -> list[_Episode]:
-    """Reads where all episodes are."""
+def _find_episodes(dataset: _Dataset) -> list[_Location]:
     video = f"videos/{dataset.camera}/"
     names = ["episode_index", "length", "data/chunk_index", "data/file_index"]
     if dataset.is_video:
@@ -157,26 +144,24 @@ def _find_episodes(dataset: _Dataset) -> list[_Episode]:
         *integers, start = [*row.values(), 0.0][: len(names) | 1]
         is_known = all(isinstance(value, int) for value in integers)
         if not is_known or not isinstance(start, float) or not 0 <= start < 1e9:
-            raise FormatError(f"has an episode at an impossible place: {row}")
-        index, length, *places = integers
+            raise FormatError(f"has an episode with an invalid location: {row}")
+        index, length, *numbers = integers
         if length < 2:
             raise FormatError(f"has {length} frames in episode {index}; 2 are needed")
-        data = _file(dataset, "data", *places[:2])
-        shown_in = _file(dataset, "video", *places[2:]) if dataset.is_video else None
-        episodes.append(_Episode(index, length, data, shown_in, start))
+        data = _file(dataset, "data", *numbers[:2])
+        video_file = _file(dataset, "video", *numbers[2:]) if dataset.is_video else None
+        episodes.append(_Location(index, length, data, video_file, start))
     episodes.sort()
     if [episode.index for episode in episodes] != list(range(dataset.num_episodes)):
-        raise FormatError(
-            f"has {len(rows)} episodes in meta/episodes, which are not those from 0 to "
-            f"{dataset.num_episodes - 1}"
-        )
+        wanted = f"0 to {dataset.num_episodes - 1}"
+        raise FormatError(f"has {len(rows)} episodes, not {wanted}")
     return episodes
 
 
 def _rows(
-    dataset: _Dataset, episodes: Sequence[_Episode], options: ReadOptions
+    dataset: _Dataset, episodes: Sequence[_Location], options: ReadOptions
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Yields the fields of a PixelEpisode that are in the Parquet files."""
+    """Yields each PixelEpisode's fields that are in the Parquet files."""
     names = ["episode_index", "frame_index", *dataset.columns.values()]
     if not dataset.is_video:
         names.append(dataset.camera)
@@ -184,15 +169,12 @@ def _rows(
         table = _read_table(file, names)
         indices = _numbers(table, "episode_index")
         for episode in group:
-            (places,) = np.nonzero(indices == episode.index)
-            rows = table.take(places)
+            rows = table.take(np.flatnonzero(indices == episode.index))
             options.check_bytes(f"rows of episode {episode.index}", rows.nbytes)
             times = np.arange(episode.length_frames)
             if not np.array_equal(_numbers(rows, "frame_index"), times):
-                raise FormatError(
-                    f"has other rows in {file.name} than the {len(times)} of episode "
-                    f"{episode.index}"
-                )
+                what = f"the {len(times)} rows of episode {episode.index}"
+                raise FormatError(f"does not have {what} in {file.name}")
             values = {
                 name: _numbers(rows, column)[:-1]
                 for name, column in dataset.columns.items()
@@ -206,16 +188,16 @@ def _rows(
 
 
 def _video_frames(
-    dataset: _Dataset, episodes: Sequence[_Episode], options: ReadOptions
+    dataset: _Dataset, episodes: Sequence[_Location], options: ReadOptions
 ) -> Iterator[PixelEpisode | None]:
-    """Yields each episode's frames, and None after some of them."""
+    """Yields each episode's frames, and None as a sign of life."""
     options = options._replace(frame_skip=1)
     for file, group in itertools.groupby(episodes, lambda episode: episode.video):
         assert file is not None
         rate, is_even = videos.timing(file)
         if not rate or not is_even or abs(rate / dataset.fps - 1) > _MAX_RATE_ERROR:
             raise FormatError(
-                f"has a video {file.name} of {rate or 0:.4g} frames per second, where "
+                f"has a video {file.name} of {rate or 0:.4g} frames per second, but "
                 f"{_INFO} says {dataset.fps:.4g}"
             )
         decoded, num_seen = videos.decode(file, options), 0
@@ -223,7 +205,7 @@ def _video_frames(
             skipped = round(episode.start_seconds * rate) - num_seen
             if skipped < 0:
                 raise FormatError(
-                    f"has an episode {episode.index} that begins in the one before"
+                    f"has an episode {episode.index} that overlaps another"
                 )
             for _ in itertools.islice(decoded, skipped):
                 yield None
@@ -233,7 +215,6 @@ def _video_frames(
 
 
 def _read_table(file: pathlib.Path, names: Sequence[str]) -> Any:
-    """Returns columns of a Parquet file."""
     from pyarrow import parquet
 
     require_regular(file)
@@ -245,29 +226,29 @@ def _read_table(file: pathlib.Path, names: Sequence[str]) -> Any:
 
 
 def _numbers(table: Any, name: str) -> np.ndarray:
-    """Returns a column of numbers, or of equally many of them in each row."""
+    """Returns a column of numbers, or of vectors of one length."""
     try:
         values = np.array(table[name].to_pylist())
     except ValueError as error:
         raise FormatError(f"has rows of unequal lengths in {name}") from error
     if values.dtype.kind not in "biuf":
-        raise FormatError(f"has rows without a number in {name}")
+        raise FormatError(f"has rows that are not numbers in {name}")
     return values
 
 
 def _contents(files: Sequence[Any]) -> list[bytes]:
-    """Returns the bytes of pictures."""
+    """Returns the bytes of image files."""
     contents = [file.get("bytes") for file in files if isinstance(file, dict)]
     known = [content for content in contents if isinstance(content, bytes)]
     if len(known) < len(files):
-        raise FormatError("does not keep its pictures beside the actions")
+        raise FormatError("does not store its images in the Parquet files")
     return known
 
 
 def _file(
     dataset: _Dataset, kind: str, chunk_index: int, file_index: int
 ) -> pathlib.Path:
-    """Fills in a template of a path."""
+    """Fills in a path template."""
     values = {"chunk_index": chunk_index, "file_index": file_index}
     try:
         name = dataset.paths[kind].format(video_key=dataset.camera, **values)
@@ -277,20 +258,14 @@ def _file(
 
 
 def _inside(root: pathlib.Path, relative: str) -> pathlib.Path:
-    """Returns the true path of a dataset's file.
-
-    Raises:
-      FormatError: it is not in the dataset's folder.
-    """
+    """Returns the real path of a file; FormatError if it is outside the folder."""
     parts = pathlib.PurePosixPath(relative).parts
     is_name = parts and parts[0] != "/" and ".." not in parts and len(relative) < 4096
     if not is_name or not relative.isprintable():
-        raise FormatError(f"refers to a file {relative!r:.200}, which is not in it")
+        raise FormatError(f"refers to a file {relative!r:.200} outside its folder")
     true_root = os.path.realpath(root)
     path = os.path.realpath(os.path.join(true_root, *parts))
     if os.path.commonpath([path, true_root]) != true_root:
-        raise FormatError(
-            f"has a link to somewhere else in {relative!r:.200}; copy the folder with "
-            "`cp -rL`, which follows links"
-        )
+        what = f"has a link that leaves its folder in {relative!r:.200}"
+        raise FormatError(f"{what}; copy the folder with `cp -rL`, which follows links")
     return pathlib.Path(path)

@@ -1,4 +1,4 @@
-"""Minari datasets of the format "hdf5": episodes of images, actions and rewards.
+"""Minari datasets in HDF5.
 
 Source of the format: Farama-Foundation/Minari, minari/dataset.
 """
@@ -25,12 +25,12 @@ from jaxil.files.untrusted import require_regular
 
 _DATA, _METADATA = "main_data.hdf5", "metadata.json"
 _HDF5, _JPEG = b"\x89HDF\r\n\x1a\n", b"\xff\xd8\xff"
-_FILTERS = {1, 2, 3, 32000}  # gzip, shuffle, fletcher32, lzf: no plug-ins
-_MAX_RATIO = 1100  # unpacked to packed; gzip, the tightest of them, reaches 1032
+_FILTERS = {1, 2, 3, 32000}  # gzip, shuffle, fletcher32, lzf: not plug-ins
+_MAX_RATIO = 1100  # of compression; gzip reaches 1032
 
 
 def recognises(path: pathlib.Path) -> bool:
-    """Tells whether this is a dataset's folder, or its `data` folder."""
+    """Returns whether this is a dataset's folder, or its `data` folder."""
     try:
         folder = _data_folder(path)
     except (OSError, ValueError):
@@ -41,11 +41,10 @@ def recognises(path: pathlib.Path) -> bool:
 
 
 def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
-    """Reads a dataset whose observations hold exactly one image; see `recording`.
+    """Reads a dataset whose observations contain exactly one image.
 
-    That image is uint8 [H, W, 3], stored as it is or, as Minari does by itself from 32
-    pixels a side on, as a JPEG. It may stand alone or in a dictionary. Actions that are
-    not vectors of real numbers are left out, with a note.
+    It is stored as uint8 [H, W, 3], or as a JPEG, which Minari uses from 32x32 pixels,
+    alone or in a dictionary. Actions that are not vectors of real numbers are ignored.
     """
     folder = _data_folder(path)
     metadata = {}  # older datasets have none
@@ -53,7 +52,7 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
         metadata = read_json(folder / _METADATA)
     stored_as = metadata.get("data_format", "hdf5")
     if stored_as != "hdf5":
-        raise FormatError(f"has data_format={stored_as!r:.50}; only 'hdf5' can be read")
+        raise FormatError(f"has data_format={stored_as!r:.50}, not 'hdf5'")
     try:
         import h5py
     except ImportError:
@@ -63,20 +62,19 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
         found = [re.fullmatch(r"episode_(\d{1,9})", str(name)) for name in file]
         numbers = sorted(int(match[1]) for match in found if match is not None)
         if not numbers or numbers != list(range(len(numbers))):
-            raise FormatError("has no episodes that are numbered from 0 on")
+            raise FormatError("has no episodes numbered from 0")
         promised = metadata.get("total_episodes", len(numbers))
         if promised != len(numbers):
             raise FormatError(
-                f"holds {len(numbers)} episodes, where {_METADATA} says "
-                f"{promised!r:.50}"
+                f"holds {len(numbers)} episodes, but {_METADATA} says {promised!r:.50}"
             )
         first = _member(file, "episode_0")
         image = _image_in(first)
         notes = ()
         if _is_jpeg(_member(first, image)):
-            notes += ("Its images were stored as JPEG, which changes them slightly.",)
+            notes += ("Its images are JPEGs, which have artefacts.",)
         if _actions(first, options) is None:
-            notes += ("Its actions are not vectors of real numbers, and not read.",)
+            notes += ("Its actions are ignored: they are not vectors of real numbers.",)
         task = _task_of(metadata)
         yield Recording("Minari dataset", len(numbers), task=task, notes=notes)
         for number in numbers:
@@ -94,7 +92,7 @@ def _data_folder(path: pathlib.Path) -> pathlib.Path:
 
 
 def _task_of(metadata: dict[str, Any]) -> str | None:
-    """Returns the task if it is one of dm_control, by the names that Shimmy uses."""
+    """Returns the task of dm_control behind one of Shimmy's names."""
     try:
         name = json.loads(metadata["env_spec"])["id"]
         found = re.fullmatch(r"dm_control/([a-z_]+)-([a-z_]+)-v\d+", name)
@@ -104,7 +102,7 @@ def _task_of(metadata: dict[str, Any]) -> str | None:
 
 
 def _member(group: Any, path: str) -> Any:
-    """Returns a group or dataset that lies in this file."""
+    """Returns a group or dataset of this file; follows no links."""
     import h5py
 
     for name in path.split("/"):
@@ -117,12 +115,12 @@ def _member(group: Any, path: str) -> Any:
 
 
 def _image_in(episode: Any) -> str:
-    """Returns the path to the one image of an observation."""
+    """Returns the path of the one image in an observation."""
     import h5py
 
     observations = _member(episode, "observations")
     found = [("observations", observations)]
-    if isinstance(observations, h5py.Group):  # a dictionary; links are not followed
+    if isinstance(observations, h5py.Group):  # a dictionary; `visititems` skips links
         observations.visititems(
             lambda path, x: found.append((f"observations/{path}", x))
         )
@@ -130,10 +128,8 @@ def _image_in(episode: Any) -> str:
     images = [p for p, x in datasets.items() if _is_plain(x) or _is_jpeg(x)]
     if len(images) != 1:
         listed = ", ".join(f"{p} of {x.dtype} {x.shape}" for p, x in datasets.items())
-        raise FormatError(
-            f"has {len(images)} images of type uint8 and shape [H, W, 3] in an "
-            f"observation, not one: {listed}"
-        )
+        found = f"{len(images)} images, uint8 [H, W, 3], in an observation"
+        raise FormatError(f"has {found}, not one: {listed}")
     return images[0]
 
 
@@ -142,7 +138,7 @@ def _is_plain(dataset: Any) -> bool:
 
 
 def _is_jpeg(dataset: Any) -> bool:
-    """Tells whether these are JPEGs: rows, or arrays where lengths are not equal."""
+    """Returns whether a dataset holds JPEGs: rows, or arrays of various lengths."""
     import h5py
 
     rows = dataset.dtype == np.uint8 and dataset.ndim == 2
@@ -161,7 +157,7 @@ def _frames(dataset: Any, options: ReadOptions) -> np.ndarray:
 
 
 def _actions(episode: Any, options: ReadOptions) -> np.ndarray | None:
-    """Returns actions [T, A]; None where they are something else."""
+    """Returns actions [T, A]; None for any other kind."""
     dataset = _member(episode, "actions")
     if getattr(dataset, "dtype", np.dtype("O")).kind != "f" or dataset.ndim > 2:
         return None
@@ -175,19 +171,17 @@ def _values(dataset: Any, options: ReadOptions) -> np.ndarray:
 
 
 def _check(dataset: Any, options: ReadOptions) -> None:
-    """Raises FormatError where a dataset's values lie elsewhere, or are too many."""
+    """Raises FormatError if the values are in another file, or too many."""
     if not hasattr(dataset, "dtype"):
         raise FormatError(f"has no numbers in {dataset.name}")
     name, plan = dataset.name, dataset.id.get_create_plist()
     if dataset.is_virtual or dataset.external:
-        raise FormatError(f"keeps {name} in another file")
+        raise FormatError(f"stores {name} in another file")
     filters = {plan.get_filter(i)[0] for i in range(plan.get_nfilters())}
     if not filters <= _FILTERS:
-        raise FormatError(f"has {name} packed by unknown filters {sorted(filters)}")
+        raise FormatError(f"has {name} with unsupported filters {sorted(filters)}")
     num_bytes = dataset.size * dataset.dtype.itemsize
     options.check_bytes(f"{name} of shape {dataset.shape}", num_bytes)
     stored = dataset.id.get_storage_size()
     if num_bytes > stored * (_MAX_RATIO if filters else 1):
-        raise FormatError(
-            f"is damaged: {name} has {num_bytes} bytes, but only {stored} are stored"
-        )
+        raise FormatError(f"is damaged: {name} stores {stored} of {num_bytes} bytes")

@@ -1,11 +1,11 @@
-"""jaxil's own file of pixels, into which every other format can be converted.
+"""jaxil's own format of pixels, to which all others can be converted.
 
-A NumPy archive (.npz) of K episodes, of lengths of their own:
+A NumPy archive (.npz) of K episodes, k = 0 ... K - 1:
 
-    frames_k    uint8 [N_k + 1, H, W, 3], for k = 0 ... K - 1
-    actions_k   float32 [N_k, A], only if they are known
-    rewards_k   float32 [N_k], only if they are known
-    metadata    a JSON text, see `write_pixels`
+    frames_k    uint8 [N_k + 1, H, W, 3]
+    actions_k   float32 [N_k, A], if known
+    rewards_k   float32 [N_k], if known
+    metadata    JSON text, see `write_pixels`
 """
 
 import json
@@ -33,32 +33,20 @@ _OPTIONAL = {"task": str, "action_repeat": int, "frames_per_second": float}
 
 
 def write_pixels(path: str | os.PathLike, recording: Recording, *, origin: str) -> None:
-    """Writes a recording, whole or not at all, an episode at a time.
+    """Writes a recording atomically, consuming its episodes one at a time.
 
-    Args:
-      path: the file.
-      recording: its episodes are used up.
-      origin: where the pixels come from, for people.
-
-    Raises:
-      FormatError: an episode of the recording cannot be read.
-      OSError: the file cannot be written.
+    `origin` says where the pixels come from.
     """
-    metadata: dict[str, Any] = {
+    metadata = {
         "format": FORMAT,
         "version": VERSION,
         "origin": origin,
-        "num_episodes": recording.num_episodes,
-        "has_actions": [],
-        "has_rewards": [],
         **{name: getattr(recording, name) for name in _OPTIONAL},
     }
 
     def arrays() -> Iterator[tuple[str, np.ndarray]]:
         for index, episode in enumerate(recording.episodes):
             yield f"frames_{index}", episode.frames
-            metadata["has_actions"].append(episode.actions is not None)
-            metadata["has_rewards"].append(episode.rewards is not None)
             if episode.actions is not None:
                 yield f"actions_{index}", episode.actions.astype(np.float32)
             if episode.rewards is not None:
@@ -69,31 +57,30 @@ def write_pixels(path: str | os.PathLike, recording: Recording, *, origin: str) 
 
 
 def recognises(path: pathlib.Path) -> bool:
-    """Tells whether `path` is a file of this format, as far as its names tell."""
+    """Returns whether a file has this format, by the names of its arrays."""
     names = archive.member_names(path)
     return "metadata" in names and "frames_0" in names
 
 
 def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
-    """Reads a file of `write_pixels`; see `recording`."""
+    """Reads a file of `write_pixels`."""
     with naming(path, path):
         metadata = _read_metadata(path)
+    stored = archive.member_names(path)
+    num_episodes = sum(name.startswith("frames_") for name in stored)
     yield Recording(
         kind="jaxil pixels",
-        num_episodes=metadata["num_episodes"],
-        notes=(f"Made from: {metadata['origin']}.",),
-        **{name: metadata[name] for name in _OPTIONAL},
+        num_episodes=num_episodes,
+        notes=(f"Origin: {metadata['origin']}.",),
+        **{name: metadata.get(name) for name in _OPTIONAL},
     )
-    for index in range(metadata["num_episodes"]):
-        names = {"frames": f"frames_{index}"}
-        for name in ("actions", "rewards"):
-            if metadata[f"has_{name}"][index]:
-                names[name] = f"{name}_{index}"
+    for index in range(num_episodes):
+        names = {name: f"{name}_{index}" for name in ("frames", "actions", "rewards")}
+        names = {k: v for k, v in names.items() if k == "frames" or v in stored}
         limits = dict.fromkeys(names.values(), options.max_bytes)
         with naming(path, path):
             arrays = archive.read_archive(path, max_bytes=limits)
-        known = {name: arrays[stored] for name, stored in names.items()}
-        yield PixelEpisode(stored_size=None, **known)
+        yield PixelEpisode(**{name: arrays[names[name]] for name in names})
 
 
 def _read_metadata(path: pathlib.Path) -> dict[str, Any]:
@@ -103,31 +90,14 @@ def _read_metadata(path: pathlib.Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise FormatError(f"has metadata that are not JSON ({error})") from error
     if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
-        raise FormatError("has frames, but metadata that lack the format's name")
+        raise FormatError("has metadata that lack the format name")
     if metadata.get("version") != VERSION:
-        raise FormatError(
-            f"has version {metadata.get('version')!r} of the format, where this "
-            f"program reads version {VERSION}"
-        )
-    num_episodes = metadata.get("num_episodes")
-    for name in ("has_actions", "has_rewards"):
-        flags = metadata.get(name)
-        if (
-            not isinstance(num_episodes, int)
-            or not isinstance(flags, list)
-            or len(flags) != num_episodes
-            or num_episodes < 1
-        ):
-            raise FormatError(
-                f"has metadata {name}={flags!r}, which do not fit "
-                f"num_episodes={num_episodes!r}"
-            )
+        version = metadata.get("version")
+        raise FormatError(f"has version {version!r} of the format, not {VERSION}")
     for name, kind in _OPTIONAL.items():
         value = metadata.get(name)
         if value is not None and (not isinstance(value, kind) or not value):
-            raise FormatError(
-                f"has metadata {name}={value!r}, where {kind.__name__} is expected"
-            )
+            raise FormatError(f"has metadata {name}={value!r}, not {kind.__name__}")
     if not isinstance(metadata.get("origin"), str):
         raise FormatError("has metadata without origin")
-    return {**dict.fromkeys(_OPTIONAL), **metadata}
+    return metadata

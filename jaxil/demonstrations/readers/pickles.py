@@ -1,16 +1,15 @@
-"""Pickles of pixel demonstrations, as ROT and PatchAIL write them.
+"""Pickles of ROT and PatchAIL.
 
 The content is a list or tuple [observations, states, actions, rewards], each an array
-or a list of K episodes, and an episode an array or a list of T items:
+or list of K episodes, and an episode an array or list of T items:
 
     observations  uint8 [K, T, 3 n, H, W], n stacked frames, the newest last
-    states        anything; not read
+    states        anything; ignored
     actions       [K, T, A], action t taken at observation t
-    rewards       [K, T], reward t arrived with observation t; the reset's is 0
+    rewards       [K, T], reward t received with observation t; 0 at the reset
 
-The observation that ends an episode is never stored. So frames 0 ... T - 1 have the
-actions 0 ... T - 2 and the rewards 1 ... T - 1: the last action, whose outcome is not
-shown, and the reset's reward are left out.
+The last observation of an episode is not stored. So frames 0 ... T - 1 go with actions
+0 ... T - 2 and rewards 1 ... T - 1; the last action and the first reward are dropped.
 
 Source: siddhanthaldar/ROT and sail-sg/PatchAIL, generate.py (order and alignment) and
 suite/dmc.py (stacks).
@@ -35,22 +34,20 @@ from jaxil.demonstrations.readers.recording import (
     first_bytes,
 )
 
-_MAX_DEPTH = 2  # lists in an episode: of steps, and of an action's numbers
+_MAX_DEPTH = 2  # of lists in an episode: steps, and an action's numbers
 
 
 def recognises(path: pathlib.Path) -> bool:
-    """Tells whether `path` is a pickle, of anything, in one of the protocols 2 to 5."""
+    """Returns whether this is any pickle of protocol 2 to 5."""
     return first_bytes(path, 2) in (b"\x80\2", b"\x80\3", b"\x80\4", b"\x80\5")
 
 
 def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
-    """Reads a pickle of nothing but arrays and plain containers; see `recording`."""
+    """Reads a pickle of arrays and plain containers only."""
     with path.open("rb") as file:
         content = _Unpickler(file, encoding="latin1").load()
     if not isinstance(content, list | tuple) or len(content) != 4:
-        raise FormatError(
-            "is a pickle, but not of a list [observations, states, actions, rewards]"
-        )
+        raise FormatError("is not a pickle of [observations, states, actions, rewards]")
     columns = {"observations": content[0], "actions": content[2], "rewards": content[3]}
     for name in ("actions", "rewards"):
         if columns[name] is None:
@@ -58,21 +55,18 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
     for name, column in columns.items():
         is_array = isinstance(column, np.ndarray) and column.ndim > 0
         if not is_array and not isinstance(column, list | tuple):
-            raise FormatError(f"has {name} that are no array and no list of arrays")
+            raise FormatError(f"has {name} that are neither array nor list of arrays")
     num_episodes = len(columns["observations"])
     if num_episodes == 0:
         raise FormatError("holds no episode")
     for name, column in columns.items():
         if len(column) != num_episodes:
-            raise FormatError(
-                f"holds {num_episodes} episodes, but {name} of {len(column)}"
-            )
+            what = f"holds {num_episodes} episodes"
+            raise FormatError(f"{what}, but {name} of {len(column)}")
     yield Recording(
         kind="ROT or PatchAIL pickle",
         num_episodes=num_episodes,
-        notes=(
-            "Episodes end one step early: their last observation is not in the file.",
-        ),
+        notes=("Episodes end one step early: their last observation is not stored.",),
     )
     bytes_left = path.stat().st_size
     for index in range(num_episodes):
@@ -80,14 +74,13 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
             name: _numbers(name, column[index], options)
             for name, column in columns.items()
         }
-        # A small file can name one array very often, which would take forever.
+        # A small file can refer to one array very often.
         bytes_left -= values["observations"].nbytes
         if bytes_left < 0:
             raise FormatError("uses one array several times")
         shapes = {name: value.shape for name, value in values.items()}
         if len({shape[:1] for shape in shapes.values()}) > 1:
-            raise FormatError(f"has an episode {index} of unequal steps: {shapes}")
-        # Each action and reward beside the frame that it belongs to.
+            raise FormatError(f"has different lengths in episode {index}: {shapes}")
         yield PixelEpisode(
             newest_frames(values["observations"]),
             values["actions"][:-1] if "actions" in values else None,
@@ -98,7 +91,7 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
 def _numbers(
     name: str, value: Any, options: ReadOptions, depth: int = _MAX_DEPTH
 ) -> np.ndarray:
-    """Returns numbers as one array, whatever lists they are in."""
+    """Returns nested lists of numbers as one array."""
     if isinstance(value, int | float | np.number):
         return np.array(float(value))
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
@@ -108,7 +101,7 @@ def _numbers(
         isinstance(value, np.ndarray) and value.dtype == object and value.ndim == 1
     )
     if not is_list or not len(value) or depth == 0:
-        raise FormatError(f"has {name} that are no array and no list of arrays")
+        raise FormatError(f"has {name} that are neither array nor list of arrays")
     first = _numbers(name, value[0], options, depth - 1)
     options.check_bytes(name, first.nbytes * len(value))
     stacked = np.empty((len(value), *first.shape), first.dtype)
@@ -121,7 +114,7 @@ def _numbers(
 
 
 def _encode(text: str, encoding: str) -> bytes:
-    """Stands in for `_codecs.encode`, which can do more than encode."""
+    """Replaces `_codecs.encode`, which would run any registered codec."""
     del encoding
     return text.encode("latin-1")
 
@@ -129,7 +122,7 @@ def _encode(text: str, encoding: str) -> bytes:
 _ALLOWED: dict[str, Any] = {
     "numpy.ndarray": np.ndarray,
     "numpy.dtype": np.dtype,
-    # The names of their modules depend on the version of NumPy that wrote the file.
+    # Their modules depend on the version of NumPy that wrote the file.
     "numpy._reconstruct": np.empty(0).__reduce__()[0],
     "numpy._frombuffer": np.empty(1).__reduce_ex__(5)[0],
     "numpy.scalar": np.float32(0).__reduce__()[0],
@@ -142,13 +135,13 @@ _NUMPY_MODULE = re.compile(r"numpy\._?core\.(multiarray|_multiarray_umath|numeri
 
 
 class _Unpickler(pickle.Unpickler):
-    """Imports what arrays and plain containers need, and nothing else."""
+    """Imports only what arrays and plain containers need."""
 
     def find_class(self, module: str, name: str) -> Any:
         package = _NUMPY_MODULE.sub("numpy", module).replace("__builtin__", "builtins")
         if f"{package}.{name}" not in _ALLOWED:
-            raise FormatError(
-                f"imports {module}.{name}, where only NumPy arrays and plain "
-                "containers are read: nothing was executed"
+            allowed = (
+                "only arrays and plain containers are allowed; nothing was executed"
             )
+            raise FormatError(f"imports {module}.{name}, but {allowed}")
         return _ALLOWED[f"{package}.{name}"]

@@ -1,6 +1,6 @@
-"""Folders of episodes that replays of DrQ-v2 and DreamerV2 store, V-D4RL among them.
+"""Replay folders of DrQ-v2 and DreamerV2, including V-D4RL.
 
-Each `.npz` file is one episode of T entries, the first of which is the reset:
+Each `.npz` file is one episode of T entries, of which the first is the reset:
 
     DrQ-v2      observation   uint8 [T, 3 n, H, W], n stacked frames, the newest last
                 reward        [T, 1]
@@ -9,9 +9,8 @@ Each `.npz` file is one episode of T entries, the first of which is the reset:
                 is_first      [T], true for the reset; older files lack it
     both        action        [T, A], all 0 for the reset
 
-Action and reward t are those that led to observation t, so the reset's are left out,
-and the last observation is there. Names within the archives are compared with these,
-and never used as paths.
+Action and reward t precede observation t, so those of the reset are dropped. Names in
+the archives are never used as paths.
 
 Source: facebookresearch/drqv2, replay_buffer.py and dmc.py; danijar/dreamerv2,
 common/driver.py and common/replay.py; conglu1997/v-d4rl, hdf5_to_npz.py, with the data
@@ -40,7 +39,7 @@ _MAX_FLAG_BYTES = 16 * 1024**2
 
 
 def recognises(path: pathlib.Path) -> bool:
-    """Tells whether this is an episode or a folder with one, by the arrays' names."""
+    """Returns whether this is an episode or a folder with one, by array names."""
     try:
         return any(_frames_name(archive.member_names(file)) for file in _files(path))
     except (OSError, ValueError):
@@ -48,10 +47,7 @@ def recognises(path: pathlib.Path) -> bool:
 
 
 def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
-    """Reads a replay's folder, or one file of it, sorted by name; see `recording`.
-
-    Other files in the folder are ignored.
-    """
+    """Reads a replay's folder in order of file names, or one file of it."""
     kinds = {}
     files = list(_files(path))
     for file in files:
@@ -62,14 +58,12 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
         if frames_name := _frames_name(names):
             kinds[file] = _KINDS[frames_name]
     if not kinds:
-        raise FormatError(
-            "holds no episodes: no .npz file with arrays observation or image, action "
-            "and reward"
-        )
+        arrays = "observation or image, action and reward"
+        raise FormatError(f"holds no episodes: no .npz file with arrays {arrays}")
     notes = ()
     if len(kinds) < len(files):
         num_others = len(files) - len(kinds)
-        notes = (f"{num_others} of its {len(files)} .npz files hold no episode.",)
+        notes = (f"{num_others} of its {len(files)} .npz files are not episodes.",)
     yield Recording(" and ".join(sorted(set(kinds.values()))), len(kinds), notes=notes)
     for index, file in enumerate(kinds):
         with naming(file, path):
@@ -78,7 +72,7 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
 
 
 def _files(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Yields what may be episodes, by file name; the replays read no other suffix."""
+    """Yields files that may be episodes; replays read no other suffix."""
     if path.is_dir():
         for file in sorted(path.iterdir()):
             if file.suffix == ".npz" and file.is_file():
@@ -88,7 +82,7 @@ def _files(path: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def _frames_name(names: frozenset[str]) -> str:
-    """Returns what an episode calls its pictures; "" for other files, jaxil's too."""
+    """Returns the name of an episode's frames; "" for other files, jaxil's included."""
     if not {"action", "reward"} <= names or names & {"qpos", "metadata"}:
         return ""
     return next((name for name in _KINDS if name in names), "")
@@ -104,14 +98,14 @@ def _read_file(file: pathlib.Path, max_bytes: int) -> PixelEpisode:
     shapes = {name: array.shape for name, array in arrays.items()}
     lengths = {shape[:1] for shape in shapes.values()}
     if len(lengths) > 1 or min(lengths) < (2,):
-        raise FormatError(f"has arrays of unequal length, or too few steps: {shapes}")
+        raise FormatError(f"has arrays of different lengths or too short: {shapes}")
     if "is_first" in arrays and np.any(arrays["is_first"][1:]):
         raise FormatError("holds more than one episode: is_first is true again")
-    # DreamerV3's chunks have the same names, but the action after each observation.
+    # DreamerV3's chunks have the same names, but action t follows observation t.
     if "stepid" in names or np.any(arrays["action"][0]):
         raise FormatError(
-            "begins with an action, where the reset's zeros belong: it seems to pair "
-            "actions with observations in another way than DrQ-v2 and DreamerV2"
+            "begins with a nonzero action, so it seems to pair actions and "
+            "observations differently from DrQ-v2 and DreamerV2"
         )
     frames = newest_frames(arrays[frames_name])
     return PixelEpisode(frames, arrays["action"][1:], arrays["reward"][1:])

@@ -1,9 +1,10 @@
-"""Readers in a child process, with limits on time and memory.
+"""Runs readers in a child process with limits on time and memory.
 
-Parsers written in C may crash or run forever on hostile bytes. In a process of their
-own they end alone, and the file is refused with a FormatError.
+Parsers written in C may crash or hang on hostile files; the parent then raises
+FormatError.
 """
 
+import contextlib
 import os
 import pathlib
 from collections.abc import Callable, Iterator
@@ -17,18 +18,18 @@ from jaxil.demonstrations.readers.recording import (
     Recording,
     checked,
 )
-from jaxil.machine.child import Child, ChildError
+from jaxil.machine import child
 
-_CPU_SECONDS = 20  # from one item to the next, for a tiny file
-_BYTES_PER_SECOND = 10e6  # of a file, read and parsed on a slow machine
-_WAIT_FACTOR = 10  # others use the machine too
-_MEMORY_BYTES = 1024**3  # of the libraries, and of a decoder at 3840x2160 pixels
+_CPU_SECONDS = 20  # per item of a small file
+_BYTES_PER_SECOND = 10e6  # read and parsed on a slow machine
+_WAIT_FACTOR = 10  # of wall-clock time over CPU time
+_MEMORY_BYTES = 1024**3  # for libraries, and a decoder at 3840x2160 pixels
 _REASONS = {
     "FormatError": "{text}",
     "FileNotFoundError": "has a file that cannot be opened ({text})",
-    "timeout": "takes too long to read, which its size does not explain ({text})",
+    "timeout": "takes too long to read for its size ({text})",
     "MemoryError": "is damaged: it would fill the memory",
-    "death": "is damaged: it broke the process that read it ({text})",
+    "death": "is damaged: it crashed the process that read it ({text})",
 }
 
 
@@ -37,29 +38,30 @@ def read_in_child(
     path: pathlib.Path,
     options: ReadOptions,
 ) -> Iterator[Item]:
-    """Yields what a module's `read` yields, checked, from a child process.
+    """Yields a reader's checked items from a child process.
 
     Raises:
-      FormatError: it found a fault, or the child took too long or died.
+      FormatError: the file is invalid, or the child timed out or died.
     """
     file_bytes = path.stat().st_size if path.is_file() else 0
     cpu_seconds = _CPU_SECONDS + round(file_bytes / _BYTES_PER_SECOND)
     try:
-        with Child(
+        items = child.results(
             _serve,
             read,
             path.absolute(),
             options,
             seconds=_WAIT_FACTOR * cpu_seconds,
             cpu_seconds=cpu_seconds,
-            # A pickle is in memory as a whole, and partly twice while it is read.
+            # A whole pickle is in memory, parts of it twice.
             memory_bytes=_MEMORY_BYTES + 2 * options.max_bytes + 3 * file_bytes,
-            answer_bytes=2 * options.max_bytes,
-        ) as child:
-            for content in child:
+            result_bytes=2 * options.max_bytes,
+        )
+        with contextlib.closing(items):
+            for content in items:
                 kind = Recording if content and "kind" in content else PixelEpisode
                 yield content and kind(**content)
-    except ChildError as error:
+    except child.ChildError as error:
         reason = _REASONS.get(error.kind, "is cut off or damaged ({kind}: {text})")
         raise FormatError(reason.format(kind=error.kind, text=error.text)) from error
 
@@ -69,10 +71,10 @@ def _serve(
     path: pathlib.Path,
     options: ReadOptions,
 ) -> Iterator[dict[str, Any] | None]:
-    """Runs a reader as the child."""
-    os.environ["HDF5_PLUGIN_PRELOAD"] = "::"  # HDF5 loads no plug-ins
-    os.environ["ARROW_DEFAULT_MEMORY_POOL"] = "system"  # others reserve much
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries may complain at length
+    """Runs a reader in the child."""
+    os.environ["HDF5_PLUGIN_PRELOAD"] = "::"  # disables plug-ins
+    os.environ["ARROW_DEFAULT_MEMORY_POOL"] = "system"  # others reserve too much
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # silences libraries
     for item in checked(read(path, options)):
         content = None if item is None else item._asdict()
         if content is not None:

@@ -1,7 +1,7 @@
-"""Video files, one episode each: frames without actions or rewards. Decoded by PyAV.
+"""Video files, one episode each, without actions or rewards.
 
-A file's first bytes choose the parser, and the parser gets the opened file, not its
-name: a playlist disguised as a video cannot make it open anything else.
+PyAV gets the open file and a parser chosen by the first bytes. A playlist disguised as
+a video therefore cannot make it open other files.
 """
 
 import contextlib
@@ -25,16 +25,16 @@ from jaxil.demonstrations.readers.recording import (
 )
 
 _SUFFIXES = (".mp4", ".m4v", ".mov", ".gif", ".webm", ".mkv", ".avi")
-_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")  # that begin MP4 or MOV
-_MAX_ENTRIES = 1000  # of a folder, looked at to find out whether it holds videos
-_UNEVEN = 1.5  # longest time between two frames, over the shortest
-_FRAMES_PER_BREATH = 30  # after which the reader shows that it still works
+_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")  # first in MP4 or MOV
+_MAX_ENTRIES = 1000  # of a folder, searched for videos
+_MAX_UNEVENNESS = 1.5  # longest time between two frames, over the shortest
+_FRAMES_PER_SIGN = 30  # of life
 
-_Frame = tuple[np.ndarray, tuple[int, int]]  # scaled, with the size in the file
+_Frame = tuple[np.ndarray, tuple[int, int]]  # scaled frame, size in the file
 
 
 def recognises(path: pathlib.Path) -> bool:
-    """Tells whether this is a video file, or a folder that holds one."""
+    """Returns whether this is a video file or a folder with one."""
     try:
         if not path.is_dir():
             return _parser_of(path) is not None
@@ -45,11 +45,10 @@ def recognises(path: pathlib.Path) -> bool:
 
 
 def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
-    """Reads a video file, or a folder of them, sorted by name; see `recording`.
+    """Reads a video file, or a folder of them in order of name.
 
-    Frames are taken as they are stored, each once, whatever the times between them; one
-    of another size is scaled to the first one's. Where FFmpeg reports an error, the
-    file is refused.
+    Each stored frame is used once, whatever its timestamp, and scaled to the size of
+    the first. Any error of FFmpeg rejects the file.
     """
     files, others = [path], []
     if path.is_dir():
@@ -57,7 +56,7 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
         others = sorted(set(_visible(path)) - set(files))
     for other in others:
         if other.suffix.lower() in _SUFFIXES:
-            raise FormatError(f"holds {other.name}, which is no video")
+            raise FormatError(f"holds {other.name}, which is not a video")
     if not files:
         raise FormatError("holds no video")
     with naming(files[0], path):
@@ -65,11 +64,10 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
     notes = ()
     if not is_even:
         notes += (
-            f"{files[0].name} shows its frames for unequal times; they are taken as "
-            "equal.",
+            f"{files[0].name} has unevenly spaced frames, read as evenly spaced.",
         )
     if others:
-        notes += (f"{len(others)} other files, {others[0].name} first, are not read.",)
+        notes += (f"{len(others)} other files, {others[0].name} first, are ignored.",)
     yield Recording(
         kind="folder of videos" if path.is_dir() else "video",
         num_episodes=len(files),
@@ -81,8 +79,8 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
             other_rate, _ = timing(file)
             if rate and other_rate and not 0.95 < other_rate / rate < 1.05:
                 raise FormatError(
-                    f"has {other_rate:.4g} frames per second, where {files[0].name} "
-                    f"has {rate:.4g}"
+                    f"has {other_rate:.4g} frames per second, but {files[0].name} has "
+                    f"{rate:.4g}"
                 )
             yield from collect(decode(file, options), options)
 
@@ -90,8 +88,8 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
 def collect(
     frames: Iterable[_Frame], options: ReadOptions
 ) -> Iterator[PixelEpisode | None]:
-    """Yields None for every few decoded frames, and then all of them as an episode."""
-    pixels = bytearray()  # grows in its place, so that there is never a second copy
+    """Yields all frames as one episode, and None before as a sign of life."""
+    pixels = bytearray()  # grows without a second copy
     shape, stored_size, num_frames = (1, 1, 3), None, 0
     for frame, size in frames:
         if num_frames % options.frame_skip == 0:
@@ -100,21 +98,19 @@ def collect(
             what = f"{num_frames + 1} or more frames of {shape[1]}x{shape[0]} pixels,"
             options.check_bytes(what, len(pixels))
         num_frames += 1
-        if num_frames % _FRAMES_PER_BREATH == 0:
+        if num_frames % _FRAMES_PER_SIGN == 0:
             yield None
     if num_frames <= options.frame_skip:
-        raise FormatError(
-            f"has {num_frames} frames, too few to keep two with "
-            f"frame_skip={options.frame_skip}"
-        )
+        too_few = f"too few for frame_skip={options.frame_skip}"
+        raise FormatError(f"has {num_frames} frames, {too_few}")
     episode = np.frombuffer(pixels, np.uint8).reshape(-1, *shape)
     yield PixelEpisode(episode, stored_size=stored_size)
 
 
 def timing(path: pathlib.Path) -> tuple[float | None, bool]:
-    """Returns a video's frames per second, and whether they are evenly spaced.
+    """Returns frames per second, if known, and whether they are evenly spaced.
 
-    Nothing is decoded. The rate is None where the file has no times.
+    Reads the packets without decoding them.
     """
     file_bytes, packet_bytes, num_frames, times = path.stat().st_size, 0, 0, []
     with _opened(path) as (container, stream):
@@ -135,24 +131,24 @@ def timing(path: pathlib.Path) -> tuple[float | None, bool]:
     gaps = [later - earlier for earlier, later in itertools.pairwise(times)]
     if unit and sum(gaps):
         rate = len(gaps) / (sum(gaps) * unit)
-    # Clocks count as coarsely as in milliseconds, hence the 1.
-    is_even = not gaps or max(gaps) - 1 <= _UNEVEN * (min(gaps) + 1)
+    # The 1 allows for rounding: time units may be as coarse as milliseconds.
+    is_even = not gaps or max(gaps) - 1 <= _MAX_UNEVENNESS * (min(gaps) + 1)
     return rate and float(rate), is_even
 
 
 def _frames_of_gif(path: pathlib.Path) -> int:
-    """Returns the number of a GIF's frames, since FFmpeg takes damage for its end."""
+    """Returns the number of frames, since FFmpeg mistakes damage for the end."""
     if not path.read_bytes().rstrip(b"\0\r\n ").endswith(b";"):
         return -1
     try:
         with Image.open(path, formats=("GIF",)) as image:
             return getattr(image, "n_frames", 1)
-    except Exception:  # whatever a parser of Pillow stumbles over
+    except Exception:  # Pillow's parsers raise many kinds
         return -1
 
 
 def decode(path: pathlib.Path, options: ReadOptions) -> Iterator[_Frame]:
-    """Yields all frames [H, W, 3], upright and scaled, with the size in the file."""
+    """Yields all frames [H, W, 3], rotated and scaled, with their original size."""
     from av.video.reformatter import VideoReformatter
 
     size = None
@@ -169,14 +165,14 @@ def decode(path: pathlib.Path, options: ReadOptions) -> Iterator[_Frame]:
 
 @contextlib.contextmanager
 def _opened(path: pathlib.Path) -> Iterator[tuple[Any, Any]]:
-    """Opens a file's first moving picture; FFmpeg's complaints become FormatErrors."""
+    """Opens a file's first video stream; errors of FFmpeg become FormatErrors."""
     import av
     import av.error
     import av.logging
 
     parser = _parser_of(path)
     if parser is None:
-        raise FormatError("is no video, or no regular file")
+        raise FormatError("is not a video or not a regular file")
     av.logging.set_level(av.logging.ERROR)
     av.logging.set_skip_repeated(False)
     try:
@@ -186,7 +182,7 @@ def _opened(path: pathlib.Path) -> Iterator[tuple[Any, Any]]:
             av.open(file, format=parser) as container,
         ):
             if not container.streams.video:
-                raise FormatError("has no moving picture")
+                raise FormatError("has no video stream")
             stream = container.streams.video[0]
             stream.codec_context.thread_count = 1
             stream.codec_context.options = {"err_detect": "explode"}
@@ -198,13 +194,13 @@ def _opened(path: pathlib.Path) -> Iterator[tuple[Any, Any]]:
 
 
 def _upright(picture: np.ndarray, frame: Any) -> np.ndarray:
-    """Returns a picture [H, W, 3], turned as its frame asks for."""
+    """Applies the frame's rotation and flips to its image [H, W, 3]."""
     from av.sidedata.sidedata import Type
 
     matrix = frame.side_data.get(Type.DISPLAYMATRIX)
     if matrix is None:
         return picture
-    # x' = a x + c y, y' = b x + d y, where all but quarter turns and flips is ignored.
+    # x' = a x + c y, y' = b x + d y; only quarter turns and flips are supported.
     a, b, _, c, d = np.frombuffer(matrix, np.int32)[:5].tolist()
     if abs(b) > abs(a):
         picture, a, d = picture.swapaxes(0, 1), c, b
@@ -221,7 +217,7 @@ def _wanted_size(stored: tuple[int, int], options: ReadOptions) -> tuple[int, in
 
 
 def _parser_of(path: pathlib.Path) -> str | None:
-    """Returns what FFmpeg calls the format of a file; None for no video."""
+    """Returns FFmpeg's name of the file's format; None if it is not a video."""
     start = first_bytes(path, 12)
     if start[4:8] in _BOXES:
         return "mov"

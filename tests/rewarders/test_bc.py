@@ -4,25 +4,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import pytest
 from scipy import stats
 
-from jaxil.learner.cloning import make_cloning_step
-from jaxil.learner.policy import make_exploit
-from jaxil.learner.rewarder import Spec
+from jaxil.learner.policy import make_mean_action
+from jaxil.learner.rewarder import AgentSpec, Spec
 from jaxil.learner.update import Learner, init_train_state
 from jaxil.maths import losses
 from jaxil.maths.types import ExpertBatch
-from jaxil.rewarders.task import make_zero_rewarder
+from jaxil.rewarders import bc
 from tests.tiny_agent import make_tiny_networks
 
 SHAPE = (12, 12, 3)
+SETTINGS = {"batch_size": 16, "std": 0.1}
 NETWORKS = make_tiny_networks(feature_dim=8, hidden_dim=32, channels=(8,))
 
 
 def make_learner(shift_padding=0):
     return Learner(
         networks=NETWORKS,
-        rewarder=make_zero_rewarder(),
+        rewarder=bc.make_rewarder(AgentSpec(NETWORKS, 8, 1, shift_padding), **SETTINGS),
         learning_rate=3e-3,
         critic_target_tau=0.01,
         noise_clip=0.3,
@@ -53,17 +54,18 @@ def test_the_loss_is_scipys_log_probability():
     np.testing.assert_allclose(loss, expected, rtol=1e-5)
 
 
-def test_copies_what_it_is_shown_and_moves_nothing_else():
+def test_the_policy_copies_the_expert_and_nothing_else_moves():
     learner, expert = make_learner(), make_expert()
     before = make_state(learner)
-    step = jax.jit(make_cloning_step(learner, std=0.1))
+    step = jax.jit(bc.make_update_step(learner, **SETTINGS))
     state, first = step(before, None, expert)
     for _ in range(400):
         state, metrics = step(state, None, expert)
     assert int(state.num_updates) == 401
     assert metrics["actor/loss"] < first["actor/loss"]
-    exploit = jax.vmap(make_exploit(NETWORKS), in_axes=(None, None, 0))
-    copied = exploit(state.encoder.params, state.actor.params, expert.observation)
+    copied = make_mean_action(NETWORKS)(
+        state.encoder.params, state.actor.params, expert.observation
+    )
     np.testing.assert_allclose(copied, expert.action, atol=0.1)
     for name in ("critic", "target_critic", "rewarder"):
         jax.tree.map(
@@ -71,10 +73,19 @@ def test_copies_what_it_is_shown_and_moves_nothing_else():
         )
 
 
-def test_augmentation_is_drawn_anew_each_time():
+def test_asks_for_expert_samples_and_refuses_another_number_of_them():
+    learner = make_learner()
+    assert learner.rewarder.expert_batch_size == 16
+    with pytest.raises(AssertionError):
+        bc.make_update_step(learner, **SETTINGS)(
+            make_state(learner), None, make_expert(size=4)
+        )
+
+
+def test_each_update_has_shifts_of_its_own():
     expert = make_expert()
     for padding, expected in ((0, True), (2, False)):
-        step = jax.jit(make_cloning_step(make_learner(padding), std=0.1))
+        step = jax.jit(bc.make_update_step(make_learner(padding), **SETTINGS))
         state = make_state(make_learner(padding))
         losses_seen = [
             float(

@@ -1,0 +1,104 @@
+"""The figures of any runs: learning curves, last returns, logits; one panel a task."""
+
+import functools
+from collections.abc import Sequence
+
+from jaxil.reporting import measures, plots
+from jaxil.reporting.groups import Group, expert_returns, tasks_of
+from jaxil.reporting.measures import Curve, Final
+from jaxil.reporting.sheets import Panel, Sheet
+
+_RETURN = "task_return_mean"
+_LOGITS = ("discriminator/expert_logit", "discriminator/agent_logit")
+
+
+def curve_sheet(
+    groups: Sequence[Group], *, name: str, over: str, column: str = _RETURN
+) -> tuple[Sheet | None, list[Curve]]:
+    """Plots one line for each group.
+
+    Args:
+      groups: those to show.
+      name: of the files.
+      over: "frame" or "hours".
+      column: of eval.csv.
+
+    Returns:
+      None if no group has such a column; and the curves.
+    """
+    panels, found = [], []
+    for task, some in tasks_of(groups).items():
+        lines = [measures.curve(group, over, column) for group in some]
+        shown = [line for line in lines if line is not None]
+        if not shown:
+            continue
+        found += shown
+        if column == _RETURN:
+            label = "task return"
+            levels = [(v, f"expert {v:.0f}") for v, _ in expert_returns(some)]
+        else:
+            label, levels = "distance to the expert", [(1.0, "random policy")]
+        draw = functools.partial(
+            plots.curves, lines=shown, levels=levels, over=over, name=label
+        )
+        panels.append(Panel(task, draw))
+    caption = (
+        "Mean over seeds; the band is its 90 % confidence interval (Student's t). A "
+        "line without a band is a single seed; a line is faint where some of its seeds "
+        "have no evaluation."
+    )
+    return _sheet(name, panels, [line.group for line in found], caption), found
+
+
+def bar_sheet(finals: Sequence[Final], *, name: str) -> Sheet | None:
+    """Plots the last evaluations; None without any."""
+    tasks: dict[str, list[Final]] = {}
+    for final in finals:
+        tasks.setdefault(final.group.task, []).append(final)
+    panels = [
+        Panel(
+            task,
+            functools.partial(plots.bars, finals=some),
+            plots.bars_height(len(some)),
+            plots.BAR_MARGINS,
+        )
+        for task, some in tasks.items()
+    ]
+    caption = (
+        "Mean over seeds of the last evaluation's mean return, its 90 % confidence "
+        "interval (Student's t) and a dot for each seed. Hatched: some of these runs "
+        "are unfinished."
+    )
+    return _sheet(name, panels, [], caption)
+
+
+def logit_sheet(groups: Sequence[Group], *, name: str) -> Sheet | None:
+    """Plots the discriminators' logits over frames; None without any."""
+    panels, shown = [], []
+    for task, some in tasks_of(groups).items():
+        pairs = []
+        for group in some:
+            expert, agent = (
+                measures.curve(group, "frame", column, table="training")
+                for column in _LOGITS
+            )
+            if expert is not None and agent is not None:
+                pairs.append((expert, agent))
+                # Dashes mean something else here: the legend shows colours only.
+                shown.append(group._replace(look=group.look._replace(dashes=())))
+        if pairs:
+            panels.append(Panel(task, functools.partial(plots.logits, pairs=pairs)))
+    caption = (
+        "The discriminator's mean logit of the expert's (solid) and the agent's "
+        "(dotted) transitions, mean over seeds; label 1 is the expert."
+    )
+    return _sheet(name, panels, shown, caption)
+
+
+def _sheet(
+    name: str, panels: Sequence[Panel], groups: Sequence[Group], caption: str
+) -> Sheet | None:
+    if not panels:
+        return None
+    legend = {group.label: group.look for group in groups}
+    return Sheet(name, tuple(panels), tuple(legend.items()), caption)

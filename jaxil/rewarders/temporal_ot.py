@@ -1,0 +1,169 @@
+"""TemporalOT: optimal transport that knows the order of an episode."""
+
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxil import methods
+from jaxil.learner.rewarder import AgentSpec, Rewarder
+from jaxil.maths import transport
+from jaxil.rewarders.matching import closest_rewards
+from jaxil.rewarders.targets import make_target_rewarder
+
+METHOD = methods.Method(
+    name="temporal_ot",
+    label="TemporalOT",
+    about="optimal transport between moments of about the same time",
+    colour="#882255",
+    rank=8,
+    sections={
+        "sinkhorn": {
+            "context_length": methods.Field(
+                3, "frames that a cost is averaged over; 3 in the paper", 1, 100
+            ),
+            "band_steps": methods.Field(
+                10,
+                "largest distance in time between matched moments, in agent steps; "
+                "10 in the paper",
+                0,
+                10**6,
+            ),
+            # What is blocked costs 1000, which a larger epsilon would forgive.
+            "epsilon": methods.Field(
+                0.01, "weight of the entropy, in units of cost; 0.01", 1e-6, 1.0
+            ),
+            "num_iterations": methods.SINKHORN["num_iterations"],
+            "return_scale": methods.SINKHORN["return_scale"],
+            **methods.TARGETS,
+        }
+    },
+    metrics=("sinkhorn/scale",),
+)
+
+_BLOCKED_COST = 1e3  # far above any cosine cost; float32 still resolves costs beside it
+
+
+def make_rewarder(
+    agent: AgentSpec,
+    *,
+    context_length: int,
+    band_steps: int,
+    epsilon: float,
+    num_iterations: int,
+    target_update_steps: int,
+    return_scale: float,
+) -> Rewarder:
+    """Returns the rewarder of TemporalOT.
+
+        r_t = - scale * sum_n C_tn P_tn,    C = context cost, P = plan within the band
+
+    It is P-SIL with another cost and another plan, see `context_cost` and `band_plan`;
+    for the other arguments see `make_target_rewarder`.
+
+    Source: Fu et al. 2024, Robot Policy Learning with Temporal Optimal Transport
+    Reward, on the features of P-SIL; the paper's are those of a frozen ResNet.
+    """
+
+    def match(agent: Array, experts: Array, num_moments: Array) -> tuple[Array, Array]:
+        def one(expert: Array, own: Array) -> tuple[Array, Array]:
+            cost = context_cost(
+                transport.cosine_cost(agent, expert), own, context_length=context_length
+            )
+            mass = transport.uniform_mass(own, len(expert))
+            return cost, plan_within_band(cost, mass)
+
+        return jax.vmap(one)(experts, num_moments)
+
+    plan_within_band = functools.partial(
+        band_plan,
+        band_steps=band_steps,
+        epsilon=epsilon,
+        num_iterations=num_iterations,
+    )
+
+    def rewards(agent: Array, experts: Array, num_moments: Array) -> Array:
+        return closest_rewards(*match(agent, experts, num_moments))
+
+    def plan(agent: Array, experts: Array, num_moments: Array) -> Array:
+        costs, plans = match(agent, experts, num_moments)
+        return plans[jnp.argmin(jnp.sum(costs * plans, axis=(1, 2)))]
+
+    return make_target_rewarder(
+        agent,
+        compare=rewards,
+        plan=plan,
+        target_update_steps=target_update_steps,
+        return_scale=return_scale,
+    )
+
+
+def context_cost(cost: Array, num_moments: Array, *, context_length: int) -> Array:
+    """Averages costs over the moments that follow.
+
+        C_tn = mean over k < context_length of c_{t+k, n+k}
+
+    At the ends the mean is over the pairs that exist.
+
+    Args:
+      cost: c, of pairs of single moments. Shape [T, N].
+      num_moments: how many of the N are the expert's own. Shape [].
+      context_length: pairs in a mean; 1 returns the costs themselves.
+
+    Returns:
+      Costs; 0 for moments that are not the expert's own. Shape [T, N].
+
+    Source: Fu et al. 2024, the context-aware cost; fuyw/TemporalOT.
+    """
+    chex.assert_rank([cost, num_moments], [2, 0])
+    own = jnp.broadcast_to(jnp.arange(cost.shape[1])[None] < num_moments, cost.shape)
+
+    def total(values: Array) -> Array:
+        shifts = (
+            jnp.pad(values[k:, k:], [(0, min(k, size)) for size in values.shape])
+            for k in range(context_length)
+        )
+        return functools.reduce(jnp.add, shifts)
+
+    num_pairs = total(own.astype(cost.dtype))
+    return total(jnp.where(own, cost, 0.0)) / jnp.maximum(num_pairs, 1.0)
+
+
+def band_plan(
+    cost: Array,
+    expert_mass: Array,
+    *,
+    band_steps: int,
+    epsilon: float,
+    num_iterations: int,
+) -> Array:
+    """Returns the entropic plan that moves mass only between moments of similar time.
+
+        P_tn = 0  where  |t - n| > band_steps
+
+    A moment of the longer episode that has no partner within the band is matched
+    outside it.
+
+    Args:
+      cost: pairwise costs, of the size of cosine costs. Shape [T, N].
+      expert_mass: see `transport.sinkhorn_plan`. Shape [N].
+      band_steps: half the band's width.
+      epsilon: weight of the entropy, in units of cost; at most 1.
+      num_iterations: Sinkhorn iterations; static under jit.
+
+    Returns:
+      A plan as `transport.sinkhorn_plan` returns it. Shape [T, N].
+
+    Source: Fu et al. 2024, the temporal mask; fuyw/TemporalOT.
+    """
+    chex.assert_rank([cost, expert_mass], [2, 1])
+    agent_time, expert_time = (jnp.arange(size) for size in cost.shape)
+    inside = jnp.abs(agent_time[:, None] - expert_time[None]) <= band_steps
+    return transport.sinkhorn_plan(
+        jnp.where(inside, cost, _BLOCKED_COST),
+        expert_mass,
+        epsilon=epsilon,
+        num_iterations=num_iterations,
+    )

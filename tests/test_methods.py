@@ -1,0 +1,212 @@
+"""The table of methods: what files declare, and methods from outside."""
+
+import ast
+import inspect
+import os
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+from jaxil import config as jaxil_config
+from jaxil import methods
+from jaxil.errors import UsageError
+from tests.commands import ROOT, run, small_run
+
+_DECLARED = {
+    path.stem: path
+    for path in (ROOT / "jaxil" / "rewarders").glob("*.py")
+    if "METHOD = " in path.read_text()
+}
+each_method = pytest.mark.parametrize("name", sorted(_DECLARED))
+
+# A package of one file, as a user would write it.
+_BRIGHT = '''
+"""Rewards bright pictures."""
+
+import jax.numpy as jnp
+
+from jaxil import methods
+from jaxil.learner.rewarder import Rewarder
+
+METHOD = methods.Method(
+    name="bright",
+    label="Bright",
+    about="the brightness of what it sees",
+    sections={
+        "brightness": {
+            "weight": methods.Field(1.0, "factor on rewards", 0.0, 10.0, positive=True)
+        }
+    },
+    uses_demonstrations=False,
+    metrics=("brightness/weight",),
+)
+
+
+def make_rewarder(agent, *, weight):
+    def rewards(state, learner, episode, expert_episodes):
+        frames = episode.frames[1:].astype(jnp.float32) / 255.0
+        return weight * jnp.mean(frames, axis=(1, 2, 3))
+
+    return Rewarder(rewards, summary=lambda state: {"brightness/weight": weight})
+'''
+
+
+def python(source: str) -> str:
+    """Runs a program in a process of its own; returns what it prints."""
+    finished = subprocess.run(
+        [sys.executable, "-c", source],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60.0,
+    )
+    assert finished.returncode == 0, finished.stderr
+    return finished.stdout
+
+
+# Our own -----------------------------------------------------------------------
+
+
+def test_every_declaration_is_known_by_the_name_of_its_file():
+    assert len(_DECLARED) >= 7
+    assert set(methods.known()) >= set(_DECLARED)
+    for name in _DECLARED:
+        module = methods.load(name, "METHOD")
+        assert module == methods.get(name)
+        assert module.name == name
+
+
+@each_method
+def test_fields_are_keywords_of_the_functions_that_take_them(name):
+    method = methods.get(name)
+    fields = [field for section in method.sections.values() for field in section]
+    assert len(set(fields)) == len(fields)  # sections are merged into one call
+    for function in filter(None, (method.make_rewarder, method.make_update_step)):
+        parameters = inspect.signature(methods.load(name, function)).parameters
+        keywords = {
+            parameter.name
+            for parameter in parameters.values()
+            if parameter.kind is parameter.KEYWORD_ONLY
+        }
+        assert keywords == set(fields)
+
+
+@each_method
+def test_defaults_keep_their_own_rules_and_names_lead_to_fields(name):
+    config = jaxil_config.default_config(name, "walker_walk")
+    assert jaxil_config.problems(config, ("walker_walk",)) == []
+    method = methods.get(name)
+    known = jaxil_config.fields(name)
+    for variation in method.variations:
+        assert variation.plain == known[variation.field].default
+    assert isinstance(method.sees_actions, bool) or method.sees_actions in known
+    assert method.plays or method.total_updates > 0
+
+
+def test_labels_ranks_and_colours_are_unique():
+    for attribute in ("label", "rank", "colour"):
+        values = [getattr(methods.get(name), attribute) for name in _DECLARED]
+        assert len(set(values)) == len(values)
+    ranks = [method.rank for method in methods.known().values()]
+    assert ranks == sorted(ranks)
+
+
+def test_declarations_are_read_without_jax():
+    printed = python(
+        "import sys\n"
+        "from jaxil import config, methods\n"
+        "[config.default_config(name) for name in methods.known()]\n"
+        "print(len(methods.known()), 'jax' in sys.modules)\n"
+    )
+    assert printed.split() == [str(len(methods.known())), "False"]
+
+
+# From outside ------------------------------------------------------------------
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch) -> pathlib.Path:
+    """A folder that Python finds, with the one file of a method in it."""
+    folder = tmp_path / "site"
+    folder.mkdir()
+    (folder / "my_method.py").write_text(_BRIGHT)
+    monkeypatch.setenv(
+        "PYTHONPATH", os.pathsep.join(filter(None, (str(folder), str(ROOT))))
+    )
+    return folder
+
+
+def test_a_method_from_outside_trains(package, tmp_path):
+    del package
+    workdir = tmp_path / "run"
+    finished = run(
+        "launch",
+        *small_run("zero", workdir),
+        "--config.method=my_method:METHOD",
+        "--config.brightness.weight=0.5",
+        "--config.total_frames=2000",
+    )
+    assert finished.returncode == 0, finished.stderr
+    header, first, *_ = (workdir / "train.csv").read_text().splitlines()
+    row = dict(zip(header.split(","), first.split(",")))
+    assert float(row["brightness/weight"]) == 0.5
+    # 100 agent steps of pictures that are neither black nor white.
+    assert 0.0 < float(row["imitation_return"]) < 50.0
+    assert list(workdir.glob("checkpoints/frame_*"))
+
+
+def test_its_own_fields_are_checked_like_any_other(package, tmp_path):
+    del package
+    finished = run(
+        "launch",
+        *small_run("zero", tmp_path / "run"),
+        "--config.method=my_method:METHOD",
+        "--config.brightness.weight=-1",
+        "--config.brightness.wait=2",
+    )
+    assert finished.returncode == 2
+    assert "Traceback" not in finished.stderr
+    weight = "brightness.weight=-1.0 must lie in (0.0, 10.0]; factor on rewards"
+    assert weight in finished.stderr
+    assert "brightness.wait" in finished.stderr
+    assert not (tmp_path / "run").exists()
+
+
+def test_installed_packages_name_methods_by_entry_points(package):
+    information = package / "my_method-1.0.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text("Name: my-method\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text(
+        # The second has a name that is taken: ours stays.
+        "[jaxil.methods]\nbright = my_method:METHOD\npdac = my_method:METHOD\n"
+    )
+    printed = python(
+        "import sys\n"
+        "from jaxil import config, methods\n"
+        "bright = methods.known()['bright']\n"
+        "config = config.default_config('bright', 'walker_walk')\n"
+        "print((bright.name, bright.label, config.method, config.brightness.weight,\n"
+        "       methods.get('pdac').label, 'jax' in sys.modules))\n"
+    )
+    expected = ("bright", "Bright", "bright", 1.0, "P-DAC", False)
+    assert ast.literal_eval(printed) == expected
+
+
+@pytest.mark.parametrize(
+    ("reference", "words"),
+    [
+        ("gail", ("method='gail'", "pdac", "package.module:METHOD")),
+        ("no_such_package:METHOD", ("no_such_package", "PYTHONPATH")),
+        ("no.such.package:METHOD", ("no.such.package", "PYTHONPATH")),
+        ("jaxil.rewarders.matching:METHOD", ("is not declared", "METHOD")),
+        ("jaxil.rewarders.pdac:make_rewarder", ("is not declared", "make_rewarder")),
+    ],
+)
+def test_what_names_no_method_is_refused(reference, words):
+    with pytest.raises(UsageError) as caught:
+        methods.get(reference)
+    for word in words:
+        assert word in str(caught.value)
