@@ -1,5 +1,7 @@
 """The player against a plain loop: the same episodes, in whatever order they come."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -36,7 +38,7 @@ def environments(lengths, size, lost=()):
 
 
 def play(player, count, rounds=1000):
-    """Plays until episodes are used up, or for some rounds; returns those that ended."""
+    """Plays all episodes, or for some rounds; returns those that ended."""
     finished = []
     for _ in range(rounds):
         player.begin(lambda number: number < count)
@@ -109,7 +111,7 @@ def test_a_player_goes_on_in_the_very_next_round_with_the_same_choices():
 
 
 def test_open_episodes_are_repeated_action_by_action():
-    made = environments([4], 1)
+    made: Any = environments([4], 1)
     taken, step = [], made.step
     made.step = lambda index, action: (
         taken.append(action.tolist()),
