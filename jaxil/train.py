@@ -16,6 +16,7 @@ from jaxil.machine.signals import StopOnSignals
 from jaxil.maths.types import Episode
 from jaxil.training import assembly
 from jaxil.training.parts import Parts, make_parts
+from jaxil.training.run_log import as_floats
 
 # Names of NumPy's random streams: every draw is keyed by (seed, stream, step), so
 # that a resumed run repeats those of an unbroken one without any stored state.
@@ -87,9 +88,8 @@ class Run(Parts):
             if episodes or player is None:
                 if self.is_due(counters.last_eval_step, config.eval_every_frames):
                     self.evaluate()
-                if self.is_due(
-                    counters.last_checkpoint_step, config.checkpoint_every_frames
-                ):
+                every = config.checkpoint_every_frames
+                if self.is_due(counters.last_checkpoint_step, every):
                     self.save()
             self.progress.update(self.frame, self.stopwatch.seconds, self.returns)
         self.stopwatch.timed("update", self.flush)()
@@ -99,8 +99,7 @@ class Run(Parts):
         del number
         assert self.player is not None
         left = self.player.steps_left(self.episode_steps)
-        planned = self.frame + left * self.config.action_repeat
-        return planned < self.config.total_frames
+        return self.frame + left * self.config.action_repeat < self.config.total_frames
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Returns exploring actions [E, A] for observations [E, ...]."""
@@ -118,9 +117,8 @@ class Run(Parts):
             padded[:count] = observations
             # The state is donated at each update: its parameters are read afresh.
             encoder, actor, _ = self.state.params
-            sampled = self.agent.sample_action(
-                encoder, actor, padded, self.exploration_key, steps
-            )
+            key = self.exploration_key
+            sampled = self.agent.sample_action(encoder, actor, padded, key, steps)
             actions[~uniform] = np.asarray(sampled)[:count][~uniform]
         return actions
 
@@ -179,18 +177,14 @@ class Run(Parts):
         self.stopwatch.reward_seconds += seconds
         self.stopwatch.seconds["update"] += seconds
 
-        metrics = self.counters.metrics | self.agent.rewarder.summary(
-            self.state.rewarder
-        )
-        metrics = {name: float(value) for name, value in metrics.items()}
+        summary = self.agent.rewarder.summary(self.state.rewarder)
+        metrics = as_floats(self.counters.metrics | summary)
         metrics["replay/reward"] = self.replay.mean_reward()
         self.require_finite(metrics)
         since_last_row = time.monotonic() - self.started - self.counters.seconds
         self.counters.seconds += since_last_row / (1 + len(later))
-        self.returns = {
-            "task": float(np.sum(episode.rewards)),
-            "imitation": float(np.sum(rewards)),
-        }
+        rewards_by_kind = {"task": episode.rewards, "imitation": rewards}
+        self.returns = as_floats({n: np.sum(r) for n, r in rewards_by_kind.items()})
         later_steps = sum(len(each.actions) for each in later)
         self.log.episode(
             frame=self.frame - later_steps * self.config.action_repeat,
@@ -215,12 +209,12 @@ class Run(Parts):
 
     def refresh_is_due(self) -> bool:
         """Returns whether all stored rewards are to be recomputed now."""
-        every, counters = self.config.reward_refresh_steps, self.counters
+        every = self.config.reward_refresh_steps
         changed = self.agent.rewarder.rewards_changed
-        if every == 0 or changed is None:
+        passed = self.counters.num_steps - self.counters.last_refresh_step
+        if not every or passed < every or changed is None:
             return False
-        passed = counters.num_steps - counters.last_refresh_step
-        return passed >= every and bool(changed(self.state.rewarder))
+        return bool(changed(self.state.rewarder))
 
     def require_finite(self, values: dict[str, float]) -> None:
         """Raises TrainingDiverged where a number is not finite."""
@@ -248,7 +242,7 @@ class Run(Parts):
         counters = self.counters
         if self.player is None and not counters.owes_evaluation:
             # No episode has written these.
-            metrics = {name: float(value) for name, value in counters.metrics.items()}
+            metrics = as_floats(counters.metrics)
             self.require_finite(metrics)
             seconds = time.monotonic() - self.started
             self.log.updates(frame=self.frame, seconds=seconds, metrics=metrics)
@@ -281,13 +275,12 @@ class Run(Parts):
         self.counters.last_checkpoint_step = self.counters.num_steps
         self.counters.seconds = time.monotonic() - self.started
         open_episodes = {} if self.player is None else self.player.open_episodes
-        metrics = self.counters.metrics
         self.checkpoints.save(
             frame=self.frame,
             learner_state=self.state,
             counters={
                 **vars(self.counters),
-                "metrics": {name: float(value) for name, value in metrics.items()},
+                "metrics": as_floats(self.counters.metrics),
                 "open_episodes": {n: a.tolist() for n, a in open_episodes.items()},
             },
             replay=self.replay,
@@ -310,9 +303,8 @@ class Run(Parts):
         if self.stop_asked:
             return False
         self.stop_asked = True
-        self.progress.message(
-            f"{who}: saving; press Ctrl-C again to quit without saving"
-        )
+        again = "press Ctrl-C again to quit without saving"
+        self.progress.message(f"{who}: saving; {again}")
         return True
 
     def newest_checkpoint(self) -> str:
@@ -336,8 +328,7 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
 
     Raises:
       DemonstrationError: the demonstrations do not fit this run.
-      TrainingDiverged: a loss or reward is not finite any more.
-      EnvironmentsFailed: there are several, and they cannot go on.
+      TrainingDiverged, EnvironmentsFailed: see `Run.loop`.
     """
     demonstrations = assembly.load_demonstrations(config)
     method = methods.get(config.method)
@@ -347,10 +338,9 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
         try:
             run.loop()
         except EnvironmentsFailed as error:
-            raise EnvironmentsFailed(
-                f"{error}\nNewest checkpoint: {run.newest_checkpoint()}. Rerun the "
-                "same command to resume"
-            ) from error
+            newest = f"Newest checkpoint: {run.newest_checkpoint()}"
+            way_out = "Rerun the same command to resume"
+            raise EnvironmentsFailed(f"{error}\n{newest}. {way_out}") from error
         run.finish()
     if run.stop_asked:
         screen.say(

@@ -44,7 +44,7 @@ def test_pdac_trains_shows_itself_and_is_evaluated_again(tmp_path):
     assert again.stdout.count("episode ") == 2
     assert (tmp_path / "videos" / "evaluation.mp4").stat().st_size > 1_000
 
-    # The same command once more finds nothing left to do.
+    # The same command again finds nothing left to do.
     before = (tmp_path / "train.csv").read_text()
     assert run("launch", *small_run("pdac", tmp_path)).returncode == 0
     assert (tmp_path / "train.csv").read_text() == before
@@ -126,10 +126,12 @@ def test_state_expert_is_recorded_and_imitated(tmp_path):
 
 def test_resumes_bit_for_bit_after_a_kill(tmp_path):
     unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
-    assert run("launch", *small_run("pdac", unbroken)).returncode == 0
+    # Rewards are refreshed at frames 2000 and 4000, before the kill and after it.
+    refresh = "--config.reward_refresh_steps=150"
+    assert run("launch", *small_run("pdac", unbroken), refresh).returncode == 0
 
     process = subprocess.Popen(
-        arguments("launch", *small_run("pdac", broken)),
+        arguments("launch", *small_run("pdac", broken), refresh),
         cwd=ROOT,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -141,9 +143,9 @@ def test_resumes_bit_for_bit_after_a_kill(tmp_path):
     process.wait()
     assert not (broken / "checkpoints" / "frame_000000004000").exists()
 
-    resumed = run("launch", *small_run("pdac", broken))
+    resumed = run("launch", *small_run("pdac", broken), refresh)
     assert resumed.returncode == 0, resumed.stderr
-    assert "going on from the checkpoint of frame 2000" in resumed.stderr
+    assert "resuming from the checkpoint of frame 2000" in resumed.stderr
     expected, got = (read_csv(folder / "train.csv") for folder in (unbroken, broken))
     assert list(expected) == list(got)
     for column in expected:
@@ -153,7 +155,7 @@ def test_resumes_bit_for_bit_after_a_kill(tmp_path):
     np.testing.assert_array_equal(got["task_return_mean"], expected["task_return_mean"])
 
 
-def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path):
+def test_ctrl_c_saves_and_says_how_to_resume(tmp_path):
     flags = (*small_run("zero", tmp_path), "--config.total_frames=1000000")
     process = subprocess.Popen(
         arguments("launch", *flags),
@@ -168,7 +170,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path):
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=120)
     assert process.returncode == 130
-    assert "the same command goes on from there" in stderr
+    assert "rerun the same command to resume" in stderr
     assert "Traceback" not in stderr
     assert list((tmp_path / "checkpoints").glob("frame_*"))
 

@@ -260,6 +260,11 @@ class _Events:
         self._writer.flush()
 
 
+def as_floats(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """Reads metrics, which may wait on the device."""
+    return {name: float(value) for name, value in metrics.items()}
+
+
 def frames_per_second(num_images: int) -> float:
     """Returns the speed at which an episode plays in ten seconds or less.
 

@@ -1,5 +1,7 @@
 """Environments that count, for tests of what plays them."""
 
+from typing import Any
+
 import dm_env
 import numpy as np
 
@@ -9,7 +11,7 @@ from jaxil.environments.player import InProcess
 class Counting:
     """Frame t of episode e holds the number 10 e + t; a step is rewarded with t."""
 
-    def __init__(self, episode_steps=3):
+    def __init__(self, episode_steps: Any = 3):
         """Takes the agent steps of an episode, or a function of its number."""
         self.episode_steps = episode_steps
 
