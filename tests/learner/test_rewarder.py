@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
+from jaxil import methods
 from jaxil.learner.rewarder import make_refresh
 from jaxil.replay.replay import Replay
-from jaxil.rewarders import pdac, psil
 from tests.tiny_agent import (
     ACTION_DIM,
     SIDE,
@@ -26,26 +26,29 @@ EXPERTS = make_experts(random_frames(50, 2, STEPS + 1))
 PARAMS = make_params(0, STACK)
 
 
+SETTINGS = {
+    "pdac": {
+        "hidden_dim": 16,
+        "learning_rate": 3e-3,
+        "gradient_penalty": 10.0,
+        "batch_size": 8,
+        "sees_actions": True,
+    },
+    "psil": {
+        "cost": "cosine",
+        "alignment": "transport",
+        "epsilon": 0.05,
+        "num_iterations": 50,
+        "target_update_steps": 20,
+        "return_scale": 10.0,
+    },
+}
+
+
 @functools.cache
 def make_rewarder(method):
-    settings = {
-        pdac: {
-            "hidden_dim": 16,
-            "learning_rate": 3e-3,
-            "gradient_penalty": 10.0,
-            "batch_size": 8,
-            "sees_actions": True,
-        },
-        psil: {
-            "cost": "cosine",
-            "alignment": "transport",
-            "epsilon": 0.05,
-            "num_iterations": 50,
-            "target_update_steps": 20,
-            "return_scale": 10.0,
-        },
-    }[method]
-    rewarder = method.make_rewarder(make_agent(STACK), **settings)
+    make = methods.load(method, "make_rewarder")
+    rewarder = make(make_agent(STACK), **SETTINGS[method])
     return rewarder._replace(rewards=jax.jit(rewarder.rewards))
 
 
@@ -68,7 +71,8 @@ def fill_replay() -> Replay:
     )
     for seed in range(5):
         actions = random_actions(seed, STEPS)
-        replay.add_episode(*make_episode(random_frames(seed, STEPS + 1), actions))
+        episode = make_episode(random_frames(seed, STEPS + 1), actions)
+        replay.add_episode(**episode._asdict())
     return replay
 
 
@@ -78,10 +82,10 @@ def state_after_an_episode(method):
     state = rewarder.init(jax.random.key(0), spec, PARAMS)
     experts = EXPERTS if rewarder.matches_episodes else None
     first = make_episode(random_frames(9, STEPS + 1))
-    return rewarder.observe(state, PARAMS, first, experts), experts
+    return jax.jit(rewarder.observe)(state, PARAMS, first, experts), experts
 
 
-@pytest.mark.parametrize("method", [pdac, psil], ids=["pdac", "psil"])
+@pytest.mark.parametrize("method", ["pdac", "psil"])
 def test_refreshed_rewards_are_those_that_each_episode_would_get_now(method):
     replay, (state, experts) = fill_replay(), state_after_an_episode(method)
     slots = np.stack([replay.slots(index) for index in replay.episodes])
@@ -113,7 +117,7 @@ def test_refreshed_rewards_are_those_that_each_episode_would_get_now(method):
 )
 def test_refuses_shapes_that_do_not_belong_together(frames, indices, actions):
     with pytest.raises(AssertionError):
-        make_refresh(make_rewarder(pdac))(
+        make_refresh(make_rewarder("pdac"))(
             None,
             PARAMS,
             np.zeros(frames, np.uint8),

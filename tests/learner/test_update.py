@@ -469,6 +469,7 @@ def test_successors_come_augmented_with_their_features_and_change_nothing_else()
     _, _, _, without = seen_by_rewarder()
     state, batch, expert, after = seen_by_rewarder(samples_successors=True)
     agent = after.rewarder["agent"]
+    assert batch.successor is not None
     padded = np.pad(
         batch.successor,
         ((0, 0), (PADDING, PADDING), (PADDING, PADDING), (0, 0)),
@@ -516,7 +517,7 @@ def test_a_term_in_the_actors_loss_pulls_the_policy_and_nothing_else():
         state, metrics = jitted(learner)(state, make_batch(0), expert)
         assert np.isfinite(metrics["actor/loss"])
     before, after = (
-        np.abs(mean_action(s.params, expert.observation) - target).max()
+        np.abs(np.asarray(mean_action(s.params, expert.observation)) - target).max()
         for s in (start, state)
     )
     assert after < 0.25 < before

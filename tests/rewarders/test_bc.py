@@ -76,10 +76,9 @@ def test_the_policy_copies_the_expert_and_nothing_else_moves():
 def test_asks_for_expert_samples_and_refuses_another_number_of_them():
     learner = make_learner()
     assert learner.rewarder.expert_batch_size == 16
+    step = jax.jit(bc.make_update_step(learner, **SETTINGS))
     with pytest.raises(AssertionError):
-        bc.make_update_step(learner, **SETTINGS)(
-            make_state(learner), None, make_expert(size=4)
-        )
+        step(make_state(learner), None, make_expert(size=4))
 
 
 def test_each_update_has_shifts_of_its_own():

@@ -24,7 +24,7 @@ def rewards_of(probabilities, temperature=1.0):
 def table_of(probabilities):
     """The dynamic program cell by cell; the last column has no max."""
     table = np.zeros(probabilities.shape)
-    last = table.shape[1] - 1
+    last = len(table[0]) - 1
     for t, n in np.ndindex(*table.shape):
         covered = probabilities[t, n] * (table[t, n - 1] if n else 1.0)
         before = table[t - 1, n] if t and n < last else 0.0
