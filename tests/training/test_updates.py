@@ -303,7 +303,7 @@ def test_refreshed_rewards_are_those_of_now(tmp_path):
             run.state.rewarder, run.state.params, episode, run.experts
         )
         np.testing.assert_allclose(run.replay.rewards(number), rewards, rtol=1e-5)
-        assert np.ptp(rewards) > 0
+        assert np.ptp(np.asarray(rewards)) > 0
 
 
 def test_actions_of_several_are_those_of_each_with_noise_of_its_own_step(tmp_path):
