@@ -290,7 +290,7 @@ def test_damaged_runs_do_not_end_the_report_of_the_others(tmp_path):
     report.main(["report", str(tmp_path / "runs"), f"--output={tmp_path}/out"])
     text = (tmp_path / "out" / "index.html").read_text()
     for words in (
-        "plan that is not as long as it says",
+        "array plan whose header claims a wrong length",
         "deep/config.json is damaged",
         "eval.csv: 1 rows without a number",
         "failed, exit status unknown",

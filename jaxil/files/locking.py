@@ -44,6 +44,20 @@ def locked(path: pathlib.Path) -> Iterator[None]:
         yield
 
 
+def is_locked(path: pathlib.Path) -> bool:
+    """Returns whether another process holds the lock on a file."""
+    try:
+        with path.open() as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError as error:
+        if error.errno in _NO_LOCKS:
+            return _owner(path.with_name(f"{path.name}.owner")) is not None
+        return not isinstance(error, FileNotFoundError)
+    return False
+
+
 def _own(path: pathlib.Path) -> None:
     if _owner(path) is None:
         path.unlink(missing_ok=True)

@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from jaxil.files.locking import InUseError, locked
+from jaxil.files.locking import InUseError, is_locked, locked
 
 
 @pytest.fixture(params=[None, errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP])
@@ -26,12 +26,13 @@ def lock(request, tmp_path, monkeypatch):
 
 
 def test_one_holds_it_at_a_time(lock):
-    with (
-        locked(lock),
-        pytest.raises(InUseError, match="in use by"),
-        locked(lock),
-    ):
-        pass
+    assert not is_locked(lock)
+    with locked(lock):
+        assert is_locked(lock)
+        with pytest.raises(InUseError, match="in use by"), locked(lock):
+            pass
+        assert is_locked(lock)
+    assert not is_locked(lock)
     with locked(lock):
         pass
 
