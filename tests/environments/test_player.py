@@ -111,10 +111,12 @@ def test_a_player_goes_on_in_the_very_next_round_with_the_same_choices():
 def test_open_episodes_are_repeated_action_by_action():
     made = environments([4], 1)
     taken, step = [], made.step
-    made.step = lambda index, action: (
-        taken.append(action.tolist()),
-        step(index, action),
-    )
+
+    def taped_step(index, action):
+        taken.append(action.tolist())
+        step(index, action)
+
+    made.step = taped_step
     actions = np.array([[0.25], [-0.5]], np.float32)
     player = Player(made, first_episode=4, open_episodes={0: actions})
     player.begin(lambda _: True)
