@@ -92,6 +92,7 @@ def test_the_longest_name_will_do(tmp_path):
         workdir.write_config(
             path, jaxil_config.default_config("pdac", "walker_run"), {}
         )
+    assert (path / "config.json").is_file()
 
 
 def test_an_open_folder_is_in_use(tmp_path):
