@@ -242,10 +242,10 @@ def test_other_versions_are_said(path, caplog):
             {"task": "walker_walk"},
             "shows finger_turn_hard, but the task is walker_walk",
         ),
-        ({"num_episodes": 3}, "holds 2 episodes, and num_episodes=3"),
-        ({"num_episodes": 0}, "num_episodes=0 .* Ask for 1 to 2"),
-        ({"action_repeat": 3}, "action_repeat=2, which cannot serve action_repeat=3"),
-        ({"action_repeat": 1}, "Take a multiple of 2"),
+        ({"num_episodes": 3}, "holds 2 episodes, but num_episodes=3. Use 1 to 2"),
+        ({"num_episodes": 0}, "but num_episodes=0. Use 1 to 2"),
+        ({"action_repeat": 3}, "recorded with action_repeat=2, not 3"),
+        ({"action_repeat": 1}, "Use a multiple of 2"),
         ({"action_repeat": 10}, "shorter than one step of action_repeat=10"),
     ],
 )
@@ -280,11 +280,11 @@ TAMPERINGS = {
     "nan": (set_nan, "NaN or infinity in qvel, episode 1"),
     "wrong type": (
         lambda a: a.update(qpos=a["qpos"].astype(np.float32)),
-        "qpos of type float32, where float64",
+        "qpos of type float32, but float64 is expected",
     ),
     "a state too few": (
         lambda a: a.update(qpos=a["qpos"][:, :-1]),
-        r"qpos of shape \(2, 4, 3\), which does not fit rewards of shape \(2, 4\)",
+        r"qpos of shape \(2, 4, 3\) for rewards of \(2, 4\)",
     ),
     "an episode too few": (lambda a: a.update(actions=a["actions"][:1]), "actions of"),
     "no episodes": (
@@ -293,11 +293,11 @@ TAMPERINGS = {
     ),
     "another model": (
         lambda a: a.update(qpos=a["qpos"][..., :-1]),
-        "qpos of 2 numbers, where finger_turn_hard needs 3",
+        "qpos of 2 numbers, but finger_turn_hard needs 3",
     ),
     "actions of another model": (
         lambda a: a.update(actions=a["actions"][..., :-1]),
-        "actions of 1 numbers, where finger_turn_hard needs 2",
+        "actions of 1 numbers, but finger_turn_hard needs 2",
     ),
     "pickled": (
         lambda a: a.update(actions=np.array([{"a": 1}], dtype=object)),
@@ -311,11 +311,11 @@ TAMPERINGS = {
         lambda a: set_metadata(a, version=2),
         "version 2 of the format",
     ),
-    "no task": (lambda a: set_metadata(a, task=None), "task=None, where str"),
-    "boolean": (lambda a: set_metadata(a, seed=True), "seed=True, where int"),
+    "no task": (lambda a: set_metadata(a, task=None), "task=None, but str"),
+    "boolean": (lambda a: set_metadata(a, seed=True), "seed=True, but int"),
     "negative": (lambda a: set_metadata(a, first_episode=-1), "first_episode=-1"),
-    "few returns": (lambda a: set_metadata(a, returns=[1.0]), "2 numbers belong"),
-    "no return": (lambda a: set_metadata(a, returns=[1.0, None]), "2 numbers belong"),
+    "few returns": (lambda a: set_metadata(a, returns=[1.0]), "but 2 are expected"),
+    "no return": (lambda a: set_metadata(a, returns=[1.0, None]), "but 2 are expected"),
 }
 
 
@@ -371,7 +371,7 @@ def test_a_pipe_or_a_device_is_refused_at_once(use, tmp_path):
     pipe = tmp_path / "pipe.npz"
     os.mkfifo(pipe)
     for path in (pipe, pathlib.Path("/dev/zero")):
-        with pytest.raises(DemonstrationError, match="neither a file nor a folder"):
+        with pytest.raises(DemonstrationError, match="not a regular file"):
             use(path, **{"task": TASK, "num_episodes": 1, "action_repeat": 2})
         with pytest.raises(DemonstrationError, match="not a regular file"):
             states.read_states(path)
@@ -389,7 +389,9 @@ def test_a_header_that_promises_more_than_there_is(path):
     with zipfile.ZipFile(path, "w") as changed:
         for name, content in members.items():
             changed.writestr(name, content)
-    with pytest.raises(DemonstrationError, match="qpos that is not as long as it says"):
+    with pytest.raises(
+        DemonstrationError, match="qpos whose header claims a wrong length"
+    ):
         states.read_states(path)
 
 

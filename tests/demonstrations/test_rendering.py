@@ -1,6 +1,7 @@
 """Rendering by several processes: the same images and files, whatever happens."""
 
 import logging
+import multiprocessing
 import os
 import pathlib
 import signal
@@ -72,12 +73,9 @@ def pixels_in(folder):
     return found
 
 
-def children(pid: int | str = "self") -> list[int]:
-    """Returns processes of multiprocessing, which a process has started."""
-    tasks = pathlib.Path(f"/proc/{pid}/task").iterdir()
-    words = " ".join((task / "children").read_text() for task in tasks).split()
-    commands = {int(w): pathlib.Path(f"/proc/{w}/cmdline").read_text() for w in words}
-    return [pid for pid, command in commands.items() if "spawn_main" in command]
+def children() -> list[int]:
+    """Returns the processes of multiprocessing that this one has started."""
+    return [process.pid for process in multiprocessing.active_children()]
 
 
 def test_two_processes_render_what_one_renders(alone, tmp_path, caplog):

@@ -207,5 +207,5 @@ def test_sinkhorn_divergence_of_equal_sets_is_zero_and_it_is_symmetric():
     np.testing.assert_allclose(divergence(x, x), 0.0, atol=1e-6)
     np.testing.assert_allclose(divergence(x, x[::-1]), 0.0, atol=1e-6)
     np.testing.assert_allclose(divergence(x, y), divergence(y, x), rtol=1e-3)
-    further = divergence(x, y + jnp.linspace(0.0, 1.0, 8))
+    further = divergence(x, y + jnp.linspace(0.0, 1.0, 8)[None])
     assert 0.0 < divergence(x, y) < further
