@@ -11,7 +11,7 @@ _COMMANDS = {
     "collect": ("collect", "record, inspect or convert demonstrations"),
     "report": ("report", "make one page of any runs"),
     "sweep": ("sweep", "train many runs, here or on Slurm"),
-    "export": ("export", "write a run's policy to a file that needs jax alone"),
+    "export": ("export", "write a run's policy to a file that needs no jaxil"),
     "benchmark": ("benchmark", "time the parts of a run"),
     "doctor": ("doctor", "check this machine"),
 }
