@@ -1,13 +1,13 @@
 r"""Records, shows and converts demonstrations.
 
-    python -m jaxil.collect --workdirs=runs/expert0,runs/expert1 \
+    jaxil collect --workdirs=runs/expert0,runs/expert1 \
         --output=cartpole_swingup.npz --num_episodes=50
 
 evaluates the mean actions of the runs' policies and records the best. The file holds
 simulator states, from which each training renders pixels for its agent.
 
-    python -m jaxil.collect --inspect=FILE
-    python -m jaxil.collect --convert=IN --output=OUT.npz
+    jaxil collect --inspect=FILE
+    jaxil collect --convert=IN --output=OUT.npz
 
 summarise a file of any format, with a contact sheet and a video, and convert it to
 jaxil's format of pixels. Formats: jaxil states or pixels, ROT or PatchAIL pickles,
@@ -72,8 +72,8 @@ def _record(values: flags.FlagValues) -> None:
         )
         means.append(evaluation.mean)
         print(
-            f"{evaluation.mean:>8.1f}{evaluation.std:>8.1f}{run.frame:>10}"
-            f"{run.seconds / 60:>9.0f}  {folder}",
+            f"{evaluation.mean:>8.1f}{evaluation.std:>8.1f}{run.act.frame:>10}"
+            f"{run.act.seconds / 60:>9.0f}  {folder}",
             flush=True,
         )
     best = runs[int(np.argmax(means))]
@@ -86,7 +86,7 @@ def _record(values: flags.FlagValues) -> None:
         action_repeat=best.config.action_repeat,
         seed=_SEED,
         first_episode=0,
-        expert=f"{best.description()}; mean action, no noise",
+        expert=f"{best.act.description()}; mean action, no noise",
         rewards=arrays["rewards"],
     )
     output = pathlib.Path(values.output)

@@ -15,7 +15,7 @@ import ml_collections
 from absl import flags
 
 from jaxil import config as jaxil_config
-from jaxil import methods
+from jaxil import methods, presets
 from jaxil.config import Config
 from jaxil.errors import Fault, UsageError, unknown_name
 
@@ -113,7 +113,8 @@ def define_config(values: flags.FlagValues, default: str | None = None) -> None:
     flags.DEFINE_string(
         _CONFIG,
         default,
-        "configs/METHOD.py:TASK, or any file with get_config(); change a field with "
+        "METHOD:TASK for the paper's settings, tiny:METHOD,TASK for small ones, "
+        "expert:TASK, or FILE.py[:ARGUMENT] with a get_config(); change a field with "
         "--config.FIELD=VALUE",
         flag_values=values,
     )
@@ -176,7 +177,7 @@ def _load(
     files = [word for word in words if _name(word) == _CONFIG]
     value = files[-1].partition("=")[2] if files else default
     if not value:
-        rule, way_out = "is missing", "give a file, such as configs/pdac_walker.py"
+        rule, way_out = "is missing", "name one, such as --config=pdac:walker_walk"
         faults.append(Fault("--config", rule, way_out))
         return None
     overrides = {
@@ -197,15 +198,17 @@ def _load(
 
 
 def _config_of_file(value: str) -> Config:
-    """Runs get_config of FILE.py[:ARGUMENT]."""
+    """Runs get_config of FILE.py[:ARGUMENT], or of a preset, NAME[:ARGUMENT]."""
     name, colon, argument = value.partition(":")
     path = pathlib.Path(name).expanduser()
+    if path.suffix != ".py" and not path.is_file():
+        return presets.get_config(name, argument if colon else None).unlock()
     if not path.is_file():
         raise UsageError(
             Fault(
                 "--config",
                 f"names no file: there is no file {name!r} here",
-                "the presets are in configs/, such as configs/pdac.py:walker_walk",
+                "a preset needs none: METHOD:TASK, such as --config=pdac:walker_walk",
                 value,
             )
         )

@@ -1,6 +1,6 @@
 r"""Turns folders of runs into one page with figures, tables and videos.
 
-    python -m jaxil.report RUNS... --output=report
+    jaxil report RUNS... --output=report
 
 RUNS are folders; every folder with a config.json in or below them is a run, finished or
 not. Writes report/index.html, which needs no network, report/figures (PNG and SVG) and

@@ -1,6 +1,6 @@
 """The paper's figures: which runs each of them compares, and what a run is called.
 
-`launch/sweep.py` makes these runs and `jaxil.report` plots them.
+`jaxil sweep` makes these runs and `jaxil.report` plots them.
 """
 
 import functools

@@ -18,7 +18,7 @@ from jaxil.reporting import figures
 # Large folders of a run, in which there are no other runs.
 _OWN_FOLDERS = ("checkpoints", "replay", "tensorboard", "videos")
 _RETURN = "task_return_mean"
-_FAILED = "failed.json"  # of launch/sweep.py
+_FAILED = "failed.json"  # of `jaxil sweep`
 # What every run writes; without it a file is damaged.
 _NEEDED = {"method": str, "task": str, "seed": int, "total_frames": int}
 # Beyond any true setting, return or time; sums of larger ones would overflow.

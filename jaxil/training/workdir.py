@@ -10,12 +10,15 @@ from typing import Any
 
 from jaxil import config as jaxil_config
 from jaxil.config import Config, default_config
+from jaxil.demonstrations import loading
+from jaxil.demonstrations.states import DemonstrationError
 from jaxil.errors import Fault, UsageError
 from jaxil.files import locking, writing
 from jaxil.files.settings import as_stored, flat
 
 # Its frame; a second number tells two checkpoints of one frame apart.
 CHECKPOINT = re.compile(r"frame_(\d{12,})(?:_(\d+))?")
+_SOURCE, _DIGEST = "demonstrations.source", "demonstrations_digest"
 # No file of a run takes longer between two writes.
 _LEFTOVER_SECONDS = 60.0
 
@@ -75,6 +78,12 @@ def problems(workdir: pathlib.Path, config: Config) -> list[Fault]:
     except UsageError as error:
         return [Fault("workdir", f"cannot be resumed: {error}", value=str(workdir))]
     different = _differences(before, config)
+    stored = _read_json(workdir / "config.json").get(_DIGEST)
+    if stored is not None and jaxil_config.uses_demonstrations(config):
+        # The content decides, not its path.
+        different = [each for each in different if not each.startswith(_SOURCE)]
+        if demonstrations_digest(config) not in (stored, None):
+            different.append(f"{_SOURCE}: its content has changed since")
     if different:
         return [
             Fault(
@@ -159,7 +168,7 @@ def read_config(workdir: pathlib.Path) -> Config:
     """
     path = workdir / "config.json"
     try:
-        stored = json.loads(path.read_text())["config"]
+        stored = _read_json(path)["config"]
         config = default_config(stored["method"], stored["task"])
         known = jaxil_config.fields(stored["method"])
         there = flat(stored)
@@ -188,9 +197,24 @@ def write_config(
     Raises:
       RunFolderError: the folder is not writable.
     """
-    text = json.dumps({"config": config.to_dict(), **machine}, indent=2)
+    content = {"config": config.to_dict(), **machine}
+    if jaxil_config.uses_demonstrations(config):
+        content[_DIGEST] = demonstrations_digest(config)
+    text = json.dumps(content, indent=2)
     with writes_to(workdir):
         writing.write_atomically(workdir / "config.json", f"{text}\n".encode())
+
+
+def demonstrations_digest(config: Config) -> str | None:
+    """Returns a digest of what the demonstrations' file holds; None if unreadable."""
+    try:
+        return loading.digest(config.demonstrations.source, config.task)
+    except DemonstrationError:
+        return None
+
+
+def _read_json(path: pathlib.Path) -> dict[str, Any]:
+    return json.loads(path.read_text())
 
 
 def _differences(there: Config, here: Config) -> list[str]:
