@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxil.config import Config
 from jaxil.demonstrations import loading
-from jaxil.environments.suite import PixelEnvironment
+from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.errors import UsageError
 from jaxil.learner.state import LearnerParams
 from jaxil.training import agent as agents
