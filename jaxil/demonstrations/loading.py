@@ -12,7 +12,8 @@ import numpy as np
 from jaxil.demonstrations import foreign, mismatch, rendering, states
 from jaxil.demonstrations.readers.recording import FormatError
 from jaxil.demonstrations.states import StateDemonstrations, fault, unreadable
-from jaxil.environments import suite
+from jaxil.environments import tasks
+from jaxil.environments.interaction import Restorable
 from jaxil.files import archive
 from jaxil.maths.types import ExpertBatch
 from jaxil.replay.stacking import gather_stacks
@@ -91,6 +92,8 @@ def load(
     image_size: int = 84,
     render_quality: str = "paper",
     observation: str = "pixels",
+    camera: str = "",
+    distraction: str = "none",
     frame_skip: int = 1,
     max_bytes: int = archive.MAX_BYTES,
     cache: bool = True,
@@ -98,7 +101,7 @@ def load(
 ) -> Demonstrations:
     """Loads demonstrations; states are rendered by the agent's own environment.
 
-    Arguments not listed are those of `suite.make_environment`.
+    Arguments not listed are those of `tasks.make_environment`.
 
     Args:
       source: a file or folder of any format in `foreign.FORMATS`; "" for the task's
@@ -141,6 +144,8 @@ def load(
             image_size=image_size,
             render_quality=render_quality,
             observation=observation,
+            camera=camera,
+            distraction=distraction,
             cache=cache,
             progress=progress,
         )
@@ -282,7 +287,11 @@ def _open_states(
     if stride > stored.rewards.shape[1]:
         what = f"has episodes shorter than one step of action_repeat={action_repeat}"
         raise fault(path, what, "Choose a smaller action_repeat")
-    for name, size in _model_sizes(task).items():
+    sizes = _model_sizes(task)
+    if len(sizes) == 1:
+        what = f"holds simulator states, which {task} cannot take"
+        raise fault(path, what, "Use a file of pixels")
+    for name, size in sizes.items():
         found = getattr(stored, name).shape[2]
         if found != size:
             raise fault(path, f"has {name} of {found} numbers, but {task} needs {size}")
@@ -350,7 +359,10 @@ def _read_pixels(
 
 @functools.cache
 def _model_sizes(task: str) -> dict[str, int]:
-    """Returns the lengths of qpos, qvel, act and an action."""
-    with suite.make_environment(task, seed=0, observation="state") as environment:
-        sizes = {name: len(x) for name, x in environment.simulator_state().items()}
-        return {**sizes, "actions": environment.action_spec().shape[0]}
+    """Returns the lengths of an action, and of qpos, qvel and act if there are any."""
+    with tasks.make_environment(task, seed=0) as environment:
+        sizes = {"actions": environment.action_spec().shape[0]}
+        if isinstance(environment, Restorable):
+            states = environment.simulator_state()
+            sizes |= {name: len(array) for name, array in states.items()}
+        return sizes

@@ -4,7 +4,7 @@ import logging
 import pathlib
 from typing import Any
 
-from jaxil.environments import suite
+from jaxil.environments import suite, tasks
 
 _RATE_TOLERANCE = 0.1  # relative, of a video's frame rate
 
@@ -41,8 +41,9 @@ def warn_of_pixels(
             f"{action_repeat}: adjust action_repeat or demonstrations.frame_skip."
         )
     speed = metadata["frames_per_second"]
-    wanted = 1.0 / suite.decision_seconds(task, action_repeat)
-    if speed is not None and abs(speed / wanted - 1.0) > _RATE_TOLERANCE:
+    seconds = tasks.decision_seconds(task, action_repeat)
+    wanted = 1.0 / seconds if seconds else speed
+    if speed and wanted and abs(speed / wanted - 1.0) > _RATE_TOLERANCE:
         messages.append(
             f"{path} has {speed:.3g} frames per second, but the agent makes "
             f"{wanted:.3g} steps: about {speed / wanted:.3g} frames per step. "

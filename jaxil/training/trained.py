@@ -11,7 +11,7 @@ from jaxil import config as jaxil_config
 from jaxil.config import Config
 from jaxil.demonstrations import loading
 from jaxil.demonstrations.states import DemonstrationError
-from jaxil.environments.suite import PixelEnvironment
+from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.errors import UsageError
 from jaxil.learner.policy import make_mean_action
 from jaxil.learner.state import LearnerParams
