@@ -1,8 +1,37 @@
 """Untrusted files: what may be opened, and how their text is printed."""
 
+import errno
 import os
 import pathlib
 import stat
+from typing import BinaryIO
+
+_MAX_BYTES = 2**28  # of a file that is read at once
+
+
+def open_regular(path: str | os.PathLike) -> BinaryIO:
+    """Opens a file for reading; raises OSError for pipes and devices at once."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    mode = os.fstat(descriptor).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(descriptor)
+        number = errno.EISDIR if stat.S_ISDIR(mode) else errno.ENOTSUP
+        raise OSError(number, "not a regular file", str(path))
+    return os.fdopen(descriptor, "rb")
+
+
+def read_regular(path: str | os.PathLike, max_bytes: int = _MAX_BYTES) -> bytes:
+    """Returns a file's content.
+
+    Raises:
+      OSError: it cannot be opened, or is a pipe or device.
+      ValueError: it is larger than `max_bytes`.
+    """
+    with open_regular(path) as file:
+        content = file.read(max_bytes + 1)
+    if len(content) > max_bytes:
+        raise ValueError(f"{path}: expected at most {max_bytes} bytes")
+    return content
 
 
 def require_regular(path: str | os.PathLike, *, or_folder: bool = False) -> None:

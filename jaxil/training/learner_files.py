@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxil.files.untrusted import read_regular
+
 _FORMAT = 1
 _CHECKSUMS = "checksums.json"
 
@@ -88,7 +90,7 @@ def read(folder: pathlib.Path) -> tuple[dict, dict[str, np.ndarray]]:
         # Before orbax sees it: on a damaged file, orbax leaves tracebacks of its
         # threads on the screen, and a change within an array passes unnoticed. Files
         # that were not there then, such as a file manager's, do not matter.
-        expected = json.loads((folder / _CHECKSUMS).read_text())
+        expected = json.loads(read_regular(folder / _CHECKSUMS))
         if not expected or _checksums(folder, expected) != expected:
             raise ValueError("its files are not as they were written")
         with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
@@ -162,7 +164,7 @@ def _kind(leaf: Any) -> str:
 
 
 def _checksums(folder: pathlib.Path, names: list[str]) -> dict[str, int]:
-    return {name: zlib.crc32((folder / name).read_bytes()) for name in names}
+    return {name: zlib.crc32(read_regular(folder / name, 2**40)) for name in names}
 
 
 def _one_line(error: Exception) -> str:
