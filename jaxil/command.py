@@ -21,7 +21,7 @@ from jaxil.errors import Fault, UsageError, unknown_name
 
 Define = Callable[[flags.FlagValues], None]
 
-_CONFIG = "config"
+_CONFIG, _METHOD = "config", "method"
 _KINDS = {
     bool: "True or False",
     int: "a whole number",
@@ -65,6 +65,11 @@ def parse(argv: list[str], description: str, define: Define) -> flags.FlagValues
                 reason = str(error).split(": ", 1)[-1]
                 faults.append(Fault(f"--{name}", f"is wrong: {reason}"))
     values.mark_as_parsed()
+    for name in values[_METHOD].value if _METHOD in values else ():
+        try:
+            methods.get(name)
+        except UsageError as error:
+            faults.extend(error.faults)
     if _CONFIG in values:
         config = _load(config_words, values[_CONFIG].default, faults)
         values[_CONFIG].value = config
@@ -115,6 +120,16 @@ def define_config(values: flags.FlagValues, default: str | None = None) -> None:
         default,
         "configs/METHOD.py:TASK, or any file with get_config(); change a field with "
         "--config.FIELD=VALUE",
+        flag_values=values,
+    )
+
+
+def define_method(values: flags.FlagValues) -> None:
+    """Adds `--method=package.module:METHOD`, code from outside that runs may name."""
+    flags.DEFINE_multi_string(
+        _METHOD,
+        [],
+        "package.module:METHOD of runs whose method is not installed; its code is run",
         flag_values=values,
     )
 

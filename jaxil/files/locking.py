@@ -11,7 +11,8 @@ import threading
 import time
 from collections.abc import Iterator
 
-from jaxil.files.untrusted import printable, read_regular
+from jaxil.errors import printable
+from jaxil.files.untrusted import read_regular
 
 # Reported by file systems without locks (some NFS and Lustre mounts).
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)

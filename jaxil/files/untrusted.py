@@ -1,4 +1,4 @@
-"""Untrusted files: what may be opened, and how their text is printed."""
+"""Untrusted files: what may be opened, and how much of it is read."""
 
 import errno
 import os
@@ -28,10 +28,9 @@ def read_regular(path: str | os.PathLike, max_bytes: int = _MAX_BYTES) -> bytes:
       ValueError: it is larger than `max_bytes`.
     """
     with open_regular(path) as file:
-        content = file.read(max_bytes + 1)
-    if len(content) > max_bytes:
-        raise ValueError(f"{path}: expected at most {max_bytes} bytes")
-    return content
+        if os.fstat(file.fileno()).st_size > max_bytes:
+            raise ValueError(f"{path}: expected at most {max_bytes} bytes")
+        return file.read()
 
 
 def require_regular(path: str | os.PathLike, *, or_folder: bool = False) -> None:
@@ -44,10 +43,3 @@ def require_regular(path: str | os.PathLike, *, or_folder: bool = False) -> None
     if not stat.S_ISREG(mode) and not (or_folder and stat.S_ISDIR(mode)):
         kind = "folder" if stat.S_ISDIR(mode) else "pipe, device or socket"
         raise ValueError(f"is a {kind}, not a regular file")
-
-
-def printable(text: object, max_letters: int = 1000) -> str:
-    """Returns text on one line, without control characters and of bounded length."""
-    letters = " ".join(str(text)[: 2 * max_letters].split())
-    shown = "".join(letter if letter.isprintable() else "?" for letter in letters)
-    return shown if len(shown) <= max_letters else f"{shown[: max_letters - 3]}..."

@@ -9,15 +9,18 @@ from collections.abc import Iterator
 from typing import Any
 
 from jaxil import config as jaxil_config
+from jaxil import methods
 from jaxil.config import Config, default_config
-from jaxil.errors import Fault, UsageError
+from jaxil.errors import Fault, UsageError, printable
 from jaxil.files import locking, writing
 from jaxil.files.settings import as_stored, flat
+from jaxil.files.untrusted import read_regular
 
 # Its frame; a second number tells two checkpoints of one frame apart.
 CHECKPOINT = re.compile(r"frame_(\d{12,})(?:_(\d+))?")
 # No file of a run takes longer between two writes.
 _LEFTOVER_SECONDS = 60.0
+_MAX_CONFIG_BYTES = 10**7
 
 
 class RunFolderError(Exception):
@@ -149,17 +152,28 @@ def newest_checkpoint(workdir: pathlib.Path) -> int | None:
 
 
 def read_config(workdir: pathlib.Path) -> Config:
-    """Returns the config of the run in a folder.
+    """Returns the config of the run in a folder, whoever wrote it.
 
     Fields that did not exist when it was written have their defaults: these are what
     was done before there was a choice. Those that no longer exist are left out.
 
     Raises:
-      UsageError: there is none, or it cannot be read.
+      UsageError: there is none, it cannot be read, or its method is neither installed
+        nor named by the user (see `methods.is_trusted`).
     """
     path = workdir / "config.json"
     try:
-        stored = json.loads(path.read_text())["config"]
+        stored = json.loads(read_regular(path, _MAX_CONFIG_BYTES))["config"]
+        if ":" in stored["method"] and not methods.is_trusted(stored["method"]):
+            raise UsageError(
+                Fault(
+                    str(path),
+                    f"names code from outside as its method: {stored['method']!r}",
+                    "if you trust it, name it yourself with --method=package.module:"
+                    "METHOD (launch: --config.method; Python: jaxil.methods.get), or "
+                    "install it under the entry points jaxil.methods",
+                )
+            )
         config = default_config(stored["method"], stored["task"])
         known = jaxil_config.fields(stored["method"])
         there = flat(stored)
@@ -196,7 +210,11 @@ def write_config(
 def _differences(there: Config, here: Config) -> list[str]:
     before, now = flat(as_stored(there.to_dict())), flat(as_stored(here.to_dict()))
     return [
-        f"{field}: {before.get(field)!r} there, {now.get(field)!r} here"
+        f"{field}: {_shown(before, field)} there, {_shown(now, field)} here"
         for field in sorted(before.keys() | now.keys())
         if before.get(field) != now.get(field) and field not in jaxil_config.FREE_FIELDS
     ]
+
+
+def _shown(settings: dict[str, Any], field: str) -> str:
+    return printable(repr(settings.get(field)), 100)

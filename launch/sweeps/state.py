@@ -19,7 +19,7 @@ import os
 import pathlib
 from typing import NamedTuple
 
-from jaxil.errors import UsageError
+from jaxil.errors import UsageError, printable
 from jaxil.files import locking
 from jaxil.files.untrusted import open_regular, read_regular
 from jaxil.files.writing import write_atomically
@@ -168,7 +168,8 @@ def slurm_job(run: Run) -> str | None:
 def last_lines(run: Run, number: int) -> list[str]:
     """Returns the end of the run's log."""
     try:
-        return _tail(run.folder / "log.txt").splitlines()[-number:]
+        lines = _tail(run.folder / "log.txt").splitlines()[-number:]
+        return [printable(line) for line in lines]
     except OSError:
         return []
 
