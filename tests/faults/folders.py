@@ -72,7 +72,11 @@ def _spoil(folder: pathlib.Path, rng: np.random.Generator) -> str:
         case "brackets":
             file.write_bytes(b"[" * 200_000)
         case "exchanged":
-            other = files[rng.integers(len(files))]
+            # Of one checkpoint: else both are damaged.
+            place = file.relative_to(folder).parts[: 2 if group.is_dir() else 1]
+            near = [p for p in files if p.relative_to(folder).parts[:2] == place]
+            others = files if group.name == "replay" else near
+            other = others[rng.integers(len(others))]
             file.write_bytes(other.read_bytes())
             other.write_bytes(content)
         case "stray":

@@ -19,14 +19,9 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-os.environ.setdefault("MUJOCO_GL", "disable")  # nothing is rendered
-
-from jaxil.machine import startup
-
-startup.prepare()
-
 import numpy as np
 
+from jaxil.machine import startup
 from jaxil.machine.signals import StopOnSignals
 from jaxil.training import agent as agents
 from jaxil.training import assembly, learning_curve, parts
@@ -186,6 +181,8 @@ def out_of_disk(
 def main() -> None:
     """Runs one kind of fault."""
     kind, method, count, seed, folder = sys.argv[1:]
+    os.environ.setdefault("MUJOCO_GL", "disable")  # nothing is rendered
+    startup.prepare()
     replace_what_is_slow()
     place = pathlib.Path(folder)
     if kind == "for_ever":
