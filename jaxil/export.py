@@ -88,7 +88,7 @@ def serialized(policy: Any) -> bytes:
         (batch, *policy.observation_shape), policy.observation_dtype
     )
     act = jax.jit(lambda seen: mean_action(params.encoder, params.actor, seen))
-    return export.export(act, platforms=_PLATFORMS)(shape).serialize()
+    return bytes(export.export(act, platforms=_PLATFORMS)(shape).serialize())
 
 
 def _define(values: flags.FlagValues) -> None:

@@ -6,6 +6,8 @@ Everything is handed around explicitly: the state goes into `update_step` and co
 of it, and what it learns from is sampled here.
 """
 
+# ruff: noqa: E402
+
 import jaxil
 
 jaxil.make_environment  # noqa: B018  (chooses settings of jax and OpenGL first)

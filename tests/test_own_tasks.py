@@ -12,7 +12,7 @@ from jaxil.demonstrations import foreign
 from tests.commands import ROOT, run, small
 
 # A package of one file, as a user would write it: a light that can be pushed around.
-_OWN = '''
+_OWN = """
 import dm_env
 import numpy as np
 from dm_env import specs
@@ -63,7 +63,7 @@ def centre(image):
 
 def balance(state):
     return np.clip([0.5 * state[1] + 0.3 * state[3]], -1.0, 1.0)
-'''
+"""
 _SIZES = (
     "--config.action_repeat=2",
     "--config.seed_frames=40",

@@ -17,7 +17,8 @@ from jaxil.demonstrations.readers.recording import (
     checked,
 )
 from jaxil.demonstrations.readers.sandbox import read_in_child
-from jaxil.files.untrusted import printable, require_regular
+from jaxil.errors import printable
+from jaxil.files.untrusted import require_regular
 
 # The first that recognises a file reads it. Videos last: datasets may contain some.
 _READERS: tuple[Any, ...] = (own, pickles, minari, lerobot, replays, videos)

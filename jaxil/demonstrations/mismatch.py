@@ -5,6 +5,7 @@ import pathlib
 from typing import Any
 
 from jaxil.environments import suite, tasks
+from jaxil.errors import printable
 
 _RATE_TOLERANCE = 0.1  # relative, of a video's frame rate
 
@@ -51,7 +52,7 @@ def warn_of_pixels(
         )
     messages += [f"{path}: {note}" for note in metadata["notes"]]
     for message in messages:
-        _logger.warning("%s", message)
+        _logger.warning("%s", printable(message))
 
 
 def warn_of_versions(path: pathlib.Path, recorded: dict[str, str]) -> None:
@@ -64,6 +65,6 @@ def warn_of_versions(path: pathlib.Path, recorded: dict[str, str]) -> None:
     if differing:
         _logger.warning(
             "%s was recorded with %s: motion and appearance may differ slightly.",
-            path,
-            ", ".join(differing),
+            printable(path),
+            printable(", ".join(differing)),
         )

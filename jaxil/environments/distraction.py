@@ -5,6 +5,7 @@ Colours, camera and background vary as in the Distracting Control Suite (Stone e
 so that no data are needed, and everything keeps still within an episode.
 """
 
+import importlib
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,7 @@ class Distraction:
 
     def upload(self) -> None:
         """Hands the background to the GL context, which must exist."""
-        import mujoco
+        mujoco = importlib.import_module("mujoco")
 
         model, contexts = self._physics.model, self._physics.contexts
         with contexts.gl.make_current() as context:
@@ -66,7 +67,7 @@ class Distraction:
 
     def _backgrounds(self) -> list[int]:
         """Returns the textures of sky and floor that are whole squares of RGB."""
-        import mujoco  # reads MUJOCO_GL
+        mujoco = importlib.import_module("mujoco")  # reads MUJOCO_GL
 
         model, skybox = self._physics.model, mujoco.mjtTexture.mjTEXTURE_SKYBOX
         planes = model.geom_matid[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE]
@@ -81,7 +82,7 @@ class Distraction:
 
     def _turn_camera(self, yaw: float, roll: float) -> None:
         """Turns the camera about the vertical axis, and about its own."""
-        import mujoco
+        mujoco = importlib.import_module("mujoco")
 
         model, camera = self._physics.model, self._camera
         own = {name: self._own[name][camera] for name in _CAMERA}
