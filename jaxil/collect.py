@@ -218,7 +218,7 @@ def _define(values: flags.FlagValues) -> None:
         "comma-separated folders of runs of one task, of which the best is recorded",
         flag_values=values,
     )
-    command.define_method(values)
+    command.define_trust(values)
     text("inspect", help="file or folder of any format to summarise")
     text("convert", help="file or folder to convert to pixels; also --convert IN OUT")
     text("output", help="NAME.npz; for --inspect a folder for contact sheet and video")

@@ -21,7 +21,7 @@ from jaxil.errors import Fault, UsageError, unknown_name
 
 Define = Callable[[flags.FlagValues], None]
 
-_CONFIG, _METHOD = "config", "method"
+_CONFIG, _TRUST = "config", "trust"
 _KINDS = {
     bool: "True or False",
     int: "a whole number",
@@ -65,11 +65,8 @@ def parse(argv: list[str], description: str, define: Define) -> flags.FlagValues
                 reason = str(error).split(": ", 1)[-1]
                 faults.append(Fault(f"--{name}", f"is wrong: {reason}"))
     values.mark_as_parsed()
-    for name in values[_METHOD].value if _METHOD in values else ():
-        try:
-            methods.get(name)
-        except UsageError as error:
-            faults.extend(error.faults)
+    for name in values[_TRUST].value if _TRUST in values else ():
+        methods.trust(name)
     if _CONFIG in values:
         config = _load(config_words, values[_CONFIG].default, faults)
         values[_CONFIG].value = config
@@ -124,12 +121,12 @@ def define_config(values: flags.FlagValues, default: str | None = None) -> None:
     )
 
 
-def define_method(values: flags.FlagValues) -> None:
-    """Adds `--method=package.module:METHOD`, code from outside that runs may name."""
+def define_trust(values: flags.FlagValues) -> None:
+    """Adds `--trust=package.module:NAME`."""
     flags.DEFINE_multi_string(
-        _METHOD,
+        _TRUST,
         [],
-        "package.module:METHOD of runs whose method is not installed; its code is run",
+        "package.module:NAME, code that a run's folder names and that may be run",
         flag_values=values,
     )
 

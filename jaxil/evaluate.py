@@ -62,7 +62,7 @@ def main(argv: list[str]) -> None:
 
 def _define(values: flags.FlagValues) -> None:
     flags.DEFINE_string("workdir", None, "folder of the run", flag_values=values)
-    command.define_method(values)
+    command.define_trust(values)
     flags.DEFINE_integer(
         "num_episodes", 10, "episodes to play", 1, 100_000, flag_values=values
     )

@@ -170,9 +170,15 @@ def is_trusted(name: str) -> bool:
     """Returns whether a file may name this method.
 
     Anyone may write a run's config.json, and importing a module runs it. So the method
-    must be installed, or the user must have named it in this process, with `get`.
+    must be installed, or the user must have named it in this process: with `get`, as a
+    config's method, or with `trust`.
     """
     return name in _references() or name in _named
+
+
+def trust(name: str) -> None:
+    """Lets files name a method from outside, "package.module:METHOD"."""
+    _named.add(name)
 
 
 def load(name: str, function: str) -> Any:

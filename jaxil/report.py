@@ -84,7 +84,7 @@ def _named_runs(argv: list[str]) -> list[str]:
                 "seeds",
                 "videos",
                 "runs",
-                "method",
+                "trust",
             )
             named.append(word)
         else:
@@ -106,7 +106,7 @@ def _define(values: flags.FlagValues) -> None:
         "new folder; an older report there is replaced",
         flag_values=values,
     )
-    command.define_method(values)
+    command.define_trust(values)
     flags.DEFINE_integer(
         "seeds",
         None,

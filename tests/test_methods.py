@@ -256,7 +256,7 @@ def test_reading_a_folder_imports_no_module_that_it_names(package, trap):
     assert "'trap.inner:METHOD' is not installed here" in remarks
     assert label == "trap.inner:METHOD"
     assert "names code from outside as its method: 'trap.inner:METHOD'" in refusal
-    assert "--method=package.module:METHOD" in refusal
+    assert "--trust=trap.inner:METHOD" in refusal
     assert not _was_sprung(package)
 
 
@@ -267,7 +267,7 @@ def test_a_command_imports_a_module_that_the_user_names(package, trap, tmp_path)
     assert "names code from outside" in finished.stderr
     assert "Traceback" not in finished.stderr
     assert not _was_sprung(package)
-    words = (str(trap), "--method", "trap.inner:METHOD", f"--output={output}")
+    words = (str(trap), "--trust", "trap.inner:METHOD", f"--output={output}")
     finished = run("report", *words)
     assert finished.returncode == 0, finished.stderr
     assert "Bright" in (output / "index.html").read_text()

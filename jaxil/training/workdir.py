@@ -169,9 +169,9 @@ def read_config(workdir: pathlib.Path) -> Config:
                 Fault(
                     str(path),
                     f"names code from outside as its method: {stored['method']!r}",
-                    "if you trust it, name it yourself with --method=package.module:"
-                    "METHOD (launch: --config.method; Python: jaxil.methods.get), or "
-                    "install it under the entry points jaxil.methods",
+                    f"if you trust it, add --trust={stored['method']} (in Python: "
+                    "jaxil.methods.trust), or install it as one of the entry points "
+                    "jaxil.methods",
                 )
             )
         config = default_config(stored["method"], stored["task"])
