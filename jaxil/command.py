@@ -65,8 +65,9 @@ def parse(argv: list[str], description: str, define: Define) -> flags.FlagValues
                 reason = str(error).split(": ", 1)[-1]
                 faults.append(Fault(f"--{name}", f"is wrong: {reason}"))
     values.mark_as_parsed()
-    for name in values[_TRUST].value if _TRUST in values else ():
-        methods.trust(name)
+    if _TRUST in values:
+        for name in values[_TRUST].value or []:
+            methods.trust(name)
     if _CONFIG in values:
         config = _load(config_words, values[_CONFIG].default, faults)
         values[_CONFIG].value = config

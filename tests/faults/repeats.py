@@ -9,6 +9,7 @@ of cores is a process of its own, with all methods one after the other.
 
 import argparse
 import hashlib
+import importlib.metadata
 import json
 import os
 import subprocess
@@ -46,8 +47,6 @@ def _work(convolutions: str, cores: int, repeats: int, methods: list[str]) -> No
     from jaxil.machine import startup
 
     startup.prepare()
-    import jaxlib
-
     from tests.training import test_updates as runs
 
     runs.SIDE = SIDE
@@ -55,7 +54,7 @@ def _work(convolutions: str, cores: int, repeats: int, methods: list[str]) -> No
         compute = _computation(method, convolutions)
         digests = {compute() for _ in range(repeats)}
         row = {
-            "jaxlib": jaxlib.__version__,
+            "jaxlib": importlib.metadata.version("jaxlib"),
             "method": method,
             "convolutions": convolutions,
             "cores": cores,
@@ -109,7 +108,7 @@ def _computation(method: str, convolutions: str) -> Any:
         after = agent.update_step(fresh, *batch, None)
         digest = hashlib.sha256()
         for leaf in jax.tree.leaves((rewards, after)):
-            if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            if jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key):
                 leaf = jax.random.key_data(leaf)
             digest.update(np.asarray(leaf).tobytes())
         return digest.hexdigest()
