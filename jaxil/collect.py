@@ -56,7 +56,7 @@ def main(argv: list[str]) -> None:
 
     print(startup.prepare(), file=sys.stderr, flush=True)
     functions = (_record, _record_policy, _inspect, _convert)
-    dict(zip(_JOBS, functions, strict=True))[jobs[0]](values)
+    functions[_JOBS.index(jobs[0])](values)
 
 
 def _record(values: flags.FlagValues) -> None:
@@ -231,7 +231,10 @@ def _convert(values: flags.FlagValues) -> None:
                 path,
                 max_bytes=memory.spare_bytes(),
                 frame_skip=values.frame_skip,
-                image_size=values.image_size,
+                image_size=values.image_size or _CONVERTED_SIZE,
+                keep_aspect=values.image_size is None,
+                fit=values.fit,
+                camera=values.camera,
             )
         own.write_pixels(output, recording, origin=f"{recording.kind}, {path.name}")
     print(
@@ -307,7 +310,7 @@ def _define(values: flags.FlagValues) -> None:
     text("convert", help="file or folder to convert to pixels; also --convert IN OUT")
     text("output", help="NAME.npz; for --inspect a folder for contact sheet and video")
     number("num_episodes", 50, "episodes to record", 1, 10_000)
-    image_size = "height and width of recorded or converted images; pixels keep theirs"
+    image_size = "of images; without it videos shrink to 84 or 160, pixels keep theirs"
     number("image_size", None, image_size, 8, 1024)
     flags.DEFINE_enum(
         "render_quality",
@@ -316,6 +319,14 @@ def _define(values: flags.FlagValues) -> None:
         "how --convert and --inspect render states",
         flag_values=values,
     )
+    flags.DEFINE_enum(
+        "fit",
+        "stretch",
+        ["stretch", "crop", "pad"],
+        "how --convert --image_size makes squares of frames that are not",
+        flag_values=values,
+    )
+    text("camera", "", help="of a LeRobot dataset with several")
     number("frame_skip", 1, "--convert keeps every N-th frame of pixels", 1, 10_000)
 
 

@@ -177,8 +177,9 @@ class PixelEnvironment(dm_env.Environment):
     def episode_steps(self) -> int | None:
         """Agent steps of a whole episode; None without a time limit."""
         limit = self.step_limit
-        no_limit = limit is None or math.isinf(limit)
-        return None if no_limit else math.ceil(limit / self._action_repeat)
+        if limit is None or math.isinf(limit):
+            return None
+        return math.ceil(limit / self._action_repeat)
 
     @property
     def decision_seconds(self) -> float | None:

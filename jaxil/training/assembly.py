@@ -199,13 +199,20 @@ def load_demonstrations(
 
 def _file_settings(config: Config) -> dict[str, Any]:
     """Returns what decides whether a demonstration file can serve a run."""
+    settings = config.demonstrations
+    usual = jaxil_config.FIELDS["demonstrations.num_episodes"].default
     return {
         "task": config.task,
-        "num_episodes": config.demonstrations.num_episodes,
+        "num_episodes": settings.num_episodes,
+        "takes_fewer": bool(settings.source) and settings.num_episodes == usual,
+        "sampling": settings.sampling,
+        "fit": settings.fit,
+        "stated_action_repeat": settings.action_repeat,
+        "dataset_camera": settings.camera,
         "action_repeat": config.action_repeat,
         "image_size": config.image_size,
         "observation": config.observation,
-        "frame_skip": config.demonstrations.frame_skip,
+        "frame_skip": settings.frame_skip,
         "max_bytes": memory.spare_bytes(),
     }
 
