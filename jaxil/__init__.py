@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxil.demonstrations.loading import load as load_demonstrations
-    from jaxil.environments.suite import make_environment
+    from jaxil.environments.tasks import make_environment
     from jaxil.errors import UsageError
     from jaxil.training.trained import load_policy
 
@@ -23,7 +23,7 @@ _PLACES = {
     "UsageError": ("jaxil.errors", "UsageError"),
     "load_demonstrations": ("jaxil.demonstrations.loading", "load"),
     "load_policy": ("jaxil.training.trained", "load_policy"),
-    "make_environment": ("jaxil.environments.suite", "make_environment"),
+    "make_environment": ("jaxil.environments.tasks", "make_environment"),
 }
 
 

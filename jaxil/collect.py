@@ -4,7 +4,14 @@ r"""Records, shows and converts demonstrations.
         --output=cartpole_swingup.npz --num_episodes=50
 
 evaluates the mean actions of the runs' policies and records the best. The file holds
-simulator states, from which each training renders pixels for its agent.
+simulator states, from which each training renders pixels for its agent; for tasks that
+are not dm_control's, it holds pixels.
+
+    jaxil collect --policy=package.module:function --task=gymnasium:ID \\
+        --output=FILE.npz
+
+records a function of the task's own observation, a flat vector, that returns an action
+with all numbers in [-1, 1].
 
     jaxil collect --inspect=FILE
     jaxil collect --convert=IN --output=OUT.npz
@@ -19,17 +26,18 @@ import functools
 import pathlib
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 from absl import flags
 
 from jaxil import command
-from jaxil.errors import UsageError
+from jaxil.errors import UsageError, unknown_name
 
 _NUM_EVAL_EPISODES = 10
 _SEED = 777  # of the recording environment; no training or evaluation uses it
 _INSPECTED_SIZE, _CONVERTED_SIZE = 160, 84  # of images rendered from states
-_JOBS = ("workdirs", "inspect", "convert")
+_JOBS = ("workdirs", "policy", "inspect", "convert")
 
 
 def main(argv: list[str]) -> None:
@@ -47,13 +55,13 @@ def main(argv: list[str]) -> None:
     from jaxil.machine import startup
 
     print(startup.prepare(), file=sys.stderr, flush=True)
-    {"workdirs": _record, "inspect": _inspect, "convert": _convert}[jobs[0]](values)
+    functions = (_record, _record_policy, _inspect, _convert)
+    functions[_JOBS.index(jobs[0])](values)
 
 
 def _record(values: flags.FlagValues) -> None:
     import numpy as np
 
-    from jaxil.demonstrations import playing, states
     from jaxil.environments.evaluation import evaluate
     from jaxil.training import assembly, trained
 
@@ -77,30 +85,103 @@ def _record(values: flags.FlagValues) -> None:
             flush=True,
         )
     best = runs[int(np.argmax(means))]
-    environment = assembly.environment_with_seed(best.config, _SEED)
-    arrays = playing.play(
-        environment, lambda _: lambda _, seen: best.act(seen), values.num_episodes
-    )
-    metadata = states.new_metadata(
+    _write(
+        values,
+        assembly.environment_with_seed(best.config, _SEED),
+        best.act,
         task=best.config.task,
         action_repeat=best.config.action_repeat,
-        seed=_SEED,
-        first_episode=0,
         expert=f"{best.act.description()}; mean action, no noise",
-        rewards=arrays["rewards"],
     )
-    output = pathlib.Path(values.output)
+
+
+def _record_policy(values: flags.FlagValues) -> None:
+    from jaxil import outside
+    from jaxil.environments import suite, tasks
+
+    known = suite.known_tasks()
+    if tasks.is_of_suite(values.task or "") and values.task not in known:
+        raise UsageError(unknown_name("--task", values.task, known))
+    act = outside.load(values.policy, "--policy")
+    settings = {
+        "seed": _SEED,
+        "action_repeat": values.action_repeat,
+        "image_size": values.image_size or _CONVERTED_SIZE,
+    }
     try:
-        states.write_states(
-            output, states.StateDemonstrations(**arrays, metadata=metadata)
+        try:
+            environment = tasks.make_environment(
+                values.task, observation="state", **settings
+            )
+        except ValueError:  # it observes images alone
+            environment = tasks.make_environment(values.task, frame_stack=1, **settings)
+        _write(
+            values,
+            environment,
+            act,
+            task=values.task,
+            action_repeat=values.action_repeat,
+            expert=values.policy,
         )
+    except ValueError as error:
+        raise UsageError(f"--policy={values.policy}: {error}") from error
+
+
+def _write(
+    values: flags.FlagValues,
+    environment: Any,
+    act: Callable[[Any], Any],
+    *,
+    task: str,
+    action_repeat: int,
+    expert: str,
+) -> None:
+    """Plays and writes episodes: simulator states if the task has any, else pixels."""
+    import numpy as np
+
+    from jaxil.demonstrations import playing, states
+    from jaxil.demonstrations.readers import own
+    from jaxil.demonstrations.readers.recording import Recording
+    from jaxil.environments.interaction import Restorable
+
+    output, returns = pathlib.Path(values.output), []
+    played = (
+        environment,
+        lambda _: lambda _, seen: act(seen),
+        values.num_episodes,
+        lambda _, task_return: returns.append(task_return),
+    )
+    try:
+        if isinstance(environment, Restorable):
+            arrays = playing.play(*played)
+            metadata = states.new_metadata(
+                task=task,
+                action_repeat=action_repeat,
+                seed=_SEED,
+                first_episode=0,
+                expert=expert,
+                rewards=arrays["rewards"],
+            )
+            states.write_states(
+                output, states.StateDemonstrations(**arrays, metadata=metadata)
+            )
+        else:
+            seconds = environment.decision_seconds
+            recording = Recording(
+                "jaxil pixels",
+                values.num_episodes,
+                playing.play_pixels(*played),
+                task=task,
+                action_repeat=action_repeat,
+                frames_per_second=seconds and 1.0 / seconds,
+            )
+            own.write_pixels(output, recording, origin=f"recorded, {expert}")
     except (OSError, states.DemonstrationError) as error:
         raise UsageError(f"--output={output}: {error}") from error
-    returns = arrays["rewards"].sum(axis=1)
     print(
-        f"{output}: {len(returns)} episodes of {values.workdirs[int(np.argmax(means))]}"
-        f", return mean {returns.mean():.1f}, minimum {returns.min():.1f}, maximum "
-        f"{returns.max():.1f}, {output.stat().st_size / 1e6:.2f} MB"
+        f"{output}: {len(returns)} episodes of {expert}, return mean "
+        f"{np.mean(returns):.1f}, minimum {min(returns):.1f}, maximum "
+        f"{max(returns):.1f}, {output.stat().st_size / 1e6:.2f} MB"
     )
 
 
@@ -150,7 +231,10 @@ def _convert(values: flags.FlagValues) -> None:
                 path,
                 max_bytes=memory.spare_bytes(),
                 frame_skip=values.frame_skip,
-                image_size=values.image_size,
+                image_size=values.image_size or _CONVERTED_SIZE,
+                keep_aspect=values.image_size is None,
+                fit=values.fit,
+                camera=values.camera,
             )
         own.write_pixels(output, recording, origin=f"{recording.kind}, {path.name}")
     print(
@@ -218,11 +302,15 @@ def _define(values: flags.FlagValues) -> None:
         "comma-separated folders of runs of one task, of which the best is recorded",
         flag_values=values,
     )
+    text("policy", help="package.module:function, observation -> action, to record")
+    text("task", help="for --policy: the task, as in configs")
+    number("action_repeat", 2, "for --policy: frames of one step", 1, 100)
+    text("trust", help="package.module:name that the runs' folders may import")
     text("inspect", help="file or folder of any format to summarise")
     text("convert", help="file or folder to convert to pixels; also --convert IN OUT")
     text("output", help="NAME.npz; for --inspect a folder for contact sheet and video")
     number("num_episodes", 50, "episodes to record", 1, 10_000)
-    image_size = "height and width for --convert and --inspect; pixels keep theirs"
+    image_size = "of images; without it videos shrink to 84 or 160, pixels keep theirs"
     number("image_size", None, image_size, 8, 1024)
     flags.DEFINE_enum(
         "render_quality",
@@ -231,6 +319,14 @@ def _define(values: flags.FlagValues) -> None:
         "how --convert and --inspect render states",
         flag_values=values,
     )
+    flags.DEFINE_enum(
+        "fit",
+        "stretch",
+        ["stretch", "crop", "pad"],
+        "how --convert --image_size makes squares of frames that are not",
+        flag_values=values,
+    )
+    text("camera", "", help="of a LeRobot dataset with several")
     number("frame_skip", 1, "--convert keeps every N-th frame of pixels", 1, 10_000)
 
 

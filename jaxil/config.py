@@ -25,7 +25,11 @@ _EASY_FRAMES, _HARD_FRAMES = 1_500_000, 5_000_000
 
 FIELDS: dict[str, Field] = {
     "method": Field("pdac", "a method's name, or package.module:METHOD"),
-    "task": Field("cartpole_swingup", "a task of the DeepMind Control Suite"),
+    "task": Field(
+        "cartpole_swingup",
+        "of the DeepMind Control Suite; or gymnasium:ID; or package.module:function, "
+        "which returns a dm_env.Environment",
+    ),
     "seed": Field(0, "seeds NumPy and JAX", 0, 2**31 - 1),
     # What the agent sees and does.
     "observation": Field(
@@ -38,6 +42,12 @@ FIELDS: dict[str, Field] = {
         "paper",
         "paper: dm_control's own; fast: no shadows, for software rendering",
         choices=("paper", "fast", "smooth"),
+    ),
+    "camera": Field("", "its name or number in the task; empty: DrQ-v2's"),
+    "distraction": Field(
+        "none",
+        "random colours, camera angle and background in each of the agent's episodes",
+        choices=("none", "easy", "medium", "hard"),
     ),
     "total_frames": Field(_EASY_FRAMES, "length of the run", 1, 10**10),
     # Replay and schedule.
@@ -100,9 +110,36 @@ FIELDS: dict[str, Field] = {
         choices=("auto", "native", "xla"),
     ),
     "demonstrations.source": Field("", "a file or folder; empty: the shipped file"),
-    "demonstrations.num_episodes": Field(10, "1, 10 or 50 in the paper", 1, 10**6),
+    "demonstrations.num_episodes": Field(
+        10,
+        "1, 10 or 50 in the paper; 10 takes fewer from a source of your own that "
+        "has fewer",
+        1,
+        10**6,
+    ),
     "demonstrations.frame_skip": Field(
         1, "keeps every n-th frame of a pixel file", 1, 10**4
+    ),
+    "demonstrations.sampling": Field(
+        "frames",
+        "of pixel files; time: the frame nearest to each agent step, by the file's "
+        "frame rate or action repeat",
+        choices=("frames", "time"),
+    ),
+    "demonstrations.fit": Field(
+        "stretch",
+        "how frames that are not square become so: stretch, crop to the middle, or "
+        "pad with black",
+        choices=("stretch", "crop", "pad"),
+    ),
+    "demonstrations.action_repeat": Field(
+        0, "environment frames of a stored step, if a pixel file lacks it", 0, 1000
+    ),
+    "demonstrations.camera": Field("", "of a LeRobot dataset with several"),
+    "demonstrations.distraction": Field(
+        "none",
+        "as `distraction`, for demonstrations of simulator states",
+        choices=("none", "easy", "medium", "hard"),
     ),
     # Speed.
     "replay_on_device": Field(
@@ -236,7 +273,7 @@ def problems(config: Config, known_tasks: tuple[str, ...]) -> list[Fault]:
 
     Args:
       config: as `default_config` makes it, with changes.
-      known_tasks: all tasks that can be run.
+      known_tasks: of the control suite; those of other kinds are not checked here.
     """
     try:
         known = fields(config.method)
@@ -248,7 +285,7 @@ def problems(config: Config, known_tasks: tuple[str, ...]) -> list[Fault]:
 def _problems(
     config: Config, known: Mapping[str, Field], known_tasks: tuple[str, ...]
 ) -> Iterator[Fault]:
-    if config.task not in known_tasks:
+    if ":" not in config.task and config.task not in known_tasks:
         yield unknown_name("task", config.task, known_tasks)
     bad = set()
     for name, field in known.items():

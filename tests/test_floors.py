@@ -10,7 +10,8 @@ ROOT = pathlib.Path(__file__).parent.parent / "jaxil"
 # Rooms and files of the package by floor: each imports from floors below its own, or
 # from itself. What is not named here is a command, on top of all.
 FLOORS = {
-    "errors": 0,
+    "errors": -1,
+    "outside": 0,
     **dict.fromkeys(("methods", "maths", "machine", "files"), 1),
     **dict.fromkeys(("native", "replay"), 2),
     **dict.fromkeys(("networks", "environments"), 3),

@@ -31,9 +31,7 @@ def test_an_agent_learns_in_a_loop_of_ones_own():
 
 
 def test_the_package_is_imported_without_jax():
-    script = (
-        "import jaxil, sys; sys.exit(sum(n in sys.modules for n in ('jax', 'numpy')))"
-    )
+    script = "import jaxil, sys; sys.exit('jax' in sys.modules)"
     assert _python(script).returncode == 0
     script = "import jaxil; jaxil.nothing"
     assert "has no attribute 'nothing'" in _python(script).stderr

@@ -61,6 +61,7 @@ def inspect(path: pathlib.Path, *, max_bytes: int, **view: Any) -> Inspection:
     )
     fps = recording.frames_per_second
     summaries, pictures, video = [], [], np.empty((0, 1, 1, 3), np.uint8)
+    height = width = 0
     for episode in recording.episodes:
         frames, actions, rewards = episode.frames, episode.actions, episode.rewards
         height, width = episode.stored_size or frames.shape[1:3]
@@ -82,6 +83,10 @@ def inspect(path: pathlib.Path, *, max_bytes: int, **view: Any) -> Inspection:
         "action repeat": str(recording.action_repeat or "unknown"),
         "frames per second": "unknown" if fps is None else f"{fps:g}",
     }
+    if height != width:
+        facts["shape"] = (
+            "not square: demonstrations.fit=stretch (the default), crop or pad"
+        )
     for number, note in enumerate(recording.notes, start=1):
         facts[f"note {number}"] = note
     return Inspection(facts, summaries, pictures, video, fps or _DEFAULT_FPS)

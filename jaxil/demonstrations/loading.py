@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxil.demonstrations import foreign, mismatch, rendering, states
-from jaxil.demonstrations.readers.recording import FormatError
+from jaxil.demonstrations.readers.recording import FormatError, Recording
 from jaxil.demonstrations.states import StateDemonstrations, fault, unreadable
-from jaxil.environments import suite
+from jaxil.environments import tasks
+from jaxil.environments.interaction import Restorable
 from jaxil.files import archive
 from jaxil.maths.types import ExpertBatch
 from jaxil.replay.stacking import gather_stacks
@@ -47,6 +48,28 @@ class Demonstrations(NamedTuple):
         return float(np.mean(returns)) if returns else None
 
 
+class Reading(NamedTuple):
+    """How a file is read.
+
+    Attributes:
+      frame_skip: keeps every n-th frame of a file of pixels.
+      sampling: of a file of pixels; "time" takes the frame nearest to each agent step.
+      fit: one of `frames.FITS`: how frames of other shapes become squares.
+      dataset_camera: of a dataset with several.
+      stated_action_repeat: of a file of pixels that does not say it; 0 if unknown.
+      takes_fewer: whether fewer episodes than asked for will do.
+      max_bytes: memory limit for a file of pixels.
+    """
+
+    frame_skip: int = 1
+    sampling: str = "frames"
+    fit: str = "stretch"
+    dataset_camera: str = ""
+    stated_action_repeat: int = 0
+    takes_fewer: bool = False
+    max_bytes: int = archive.MAX_BYTES
+
+
 def check(
     source: str | os.PathLike,
     *,
@@ -55,21 +78,20 @@ def check(
     action_repeat: int,
     image_size: int = 84,
     observation: str = "pixels",
-    frame_skip: int = 1,
-    max_bytes: int = archive.MAX_BYTES,
     sees_actions: bool = False,
+    **how: Any,
 ) -> None:
     """Raises what `load` would raise, without rendering anything.
 
     `sees_actions` tells whether the method needs the expert's actions; for the other
     arguments see `load`.
     """
-    path = _path_of(source, task)
+    path, read = _path_of(source, task), Reading(**how)
     if states.recognises(path):
-        _open_states(path, task, num_episodes, action_repeat, frame_skip)
+        _open_states(path, task, num_episodes, action_repeat, read)
         return
     loaded = _load_pixels(
-        path, task, num_episodes, image_size, observation, frame_skip, max_bytes
+        path, task, num_episodes, action_repeat, image_size, observation, read
     )
     if not sees_actions:
         return
@@ -91,14 +113,15 @@ def load(
     image_size: int = 84,
     render_quality: str = "paper",
     observation: str = "pixels",
-    frame_skip: int = 1,
-    max_bytes: int = archive.MAX_BYTES,
+    camera: str = "",
+    distraction: str = "none",
     cache: bool = True,
     progress: Callable[[int, int], None] | None = None,
+    **how: Any,
 ) -> Demonstrations:
     """Loads demonstrations; states are rendered by the agent's own environment.
 
-    Arguments not listed are those of `suite.make_environment`.
+    Arguments not listed are those of `tasks.make_environment`.
 
     Args:
       source: a file or folder of any format in `foreign.FORMATS`; "" for the task's
@@ -106,28 +129,31 @@ def load(
       num_episodes: loads the file's first ones.
       action_repeat: the agent's; a multiple of the one in a file of states. Rewards of
         merged steps are summed, and the first action is kept.
-      frame_skip: keeps every n-th frame of a file of pixels.
-      max_bytes: memory limit for a file of pixels.
       cache: whether to cache rendered images.
       progress: called with (images done, all images) while rendering.
+      how: see `Reading`.
 
     Raises:
       DemonstrationError: the file cannot be read, is damaged, or does not fit.
     """
-    path = _path_of(source, task)
+    path, read = _path_of(source, task), Reading(**how)
     if not states.recognises(path):
         loaded = _load_pixels(
-            path, task, num_episodes, image_size, observation, frame_skip, max_bytes
+            path, task, num_episodes, action_repeat, image_size, observation, read
         )
         mismatch.warn_of_pixels(
             path,
             loaded.metadata,
+            loaded.num_frames,
             image_size=image_size,
             task=task,
             action_repeat=action_repeat,
+            fit=read.fit,
         )
+        mismatch.warn_of_expert(path, num_episodes, *loaded[:4])
         return loaded
-    stored, stride = _open_states(path, task, num_episodes, action_repeat, frame_skip)
+    stored, stride = _open_states(path, task, num_episodes, action_repeat, read)
+    wanted, num_episodes = num_episodes, len(stored.rewards)
     metadata = stored.metadata
     mismatch.warn_of_versions(path, metadata["versions"])
     num_steps = stored.rewards.shape[1] // stride
@@ -141,20 +167,20 @@ def load(
             image_size=image_size,
             render_quality=render_quality,
             observation=observation,
+            camera=camera,
+            distraction=distraction,
             cache=cache,
             progress=progress,
         )
     except ValueError as error:
         raise fault(path, f"cannot be rendered ({error})") from error
     rewards = stored.rewards[:, :used].reshape(num_episodes, num_steps, stride).sum(2)
+    num_frames = np.full(num_episodes, num_steps + 1)
+    actions = stored.actions[:, :used:stride]
+    mismatch.warn_of_expert(path, wanted, frames, num_frames, actions, rewards)
     served = {"file": str(path), "action_repeat": action_repeat}
-    return Demonstrations(
-        frames,
-        np.full(num_episodes, num_steps + 1),
-        stored.actions[:, :used:stride],
-        rewards,
-        {**metadata, **served, "returns": _returns(rewards)},
-    )
+    metadata = {**metadata, **served, "returns": _returns(rewards)}
+    return Demonstrations(frames, num_frames, actions, rewards, metadata)
 
 
 def sample(
@@ -267,22 +293,28 @@ def _open_states(
     task: str,
     num_episodes: int,
     action_repeat: int,
-    frame_skip: int,
+    read: Reading,
 ) -> tuple[StateDemonstrations, int]:
     """Returns a file's content, and the stored steps per agent step."""
-    stored = states.read_states(path, task=task, num_episodes=num_episodes)
+    stored = states.read_states(
+        path, task=task, num_episodes=num_episodes, takes_fewer=read.takes_fewer
+    )
     recorded = stored.metadata["action_repeat"]
     if action_repeat < 1 or action_repeat % recorded:
         what = f"was recorded with action_repeat={recorded}, not {action_repeat}"
         raise fault(path, what, f"Use a multiple of {recorded}, or record it again")
-    if frame_skip != 1:
-        what = f"holds states, but frame_skip={frame_skip} is for pixels"
+    if read.frame_skip != 1:
+        what = f"holds states, but frame_skip={read.frame_skip} is for pixels"
         raise fault(path, what, "Set demonstrations.frame_skip to 1")
     stride = action_repeat // recorded
     if stride > stored.rewards.shape[1]:
         what = f"has episodes shorter than one step of action_repeat={action_repeat}"
         raise fault(path, what, "Choose a smaller action_repeat")
-    for name, size in _model_sizes(task).items():
+    sizes = _model_sizes(task)
+    if len(sizes) == 1:
+        what = f"holds simulator states, which {task} cannot take"
+        raise fault(path, what, "Use a file of pixels")
+    for name, size in sizes.items():
         found = getattr(stored, name).shape[2]
         if found != size:
             raise fault(path, f"has {name} of {found} numbers, but {task} needs {size}")
@@ -306,25 +338,47 @@ def _read_pixels(
     stamps: tuple[tuple[str, int], ...],
     task: str,
     num_episodes: int,
+    action_repeat: int,
     image_size: int,
     observation: str,
-    frame_skip: int,
-    max_bytes: int,
+    how: Reading,
 ) -> Demonstrations:
     del stamps  # part of the key only
     if observation != "pixels":
         what = f"holds pixels or is damaged, but observation={observation!r}"
         raise fault(path, what, "Set observation to 'pixels', or use a file of states")
-    if num_episodes < 1 or frame_skip < 1:
-        what = f"does not fit num_episodes={num_episodes} and frame_skip={frame_skip}"
+    skip = how.frame_skip
+    if num_episodes < 1 or skip < 1:
+        what = f"does not fit num_episodes={num_episodes} and frame_skip={skip}"
         raise fault(path, what, "Both must be at least 1")
+    by_time = how.sampling == "time"
+    if by_time and skip > 1:
+        what = f"is sampled by time, but demonstrations.frame_skip={skip}"
+        raise fault(path, what, "Set one of the two")
+
+    def frames_per_step(recording: Recording) -> float:
+        if recording.action_repeat:
+            return action_repeat / recording.action_repeat
+        seconds, _ = tasks.timing(task, action_repeat)
+        if not recording.frames_per_second or not seconds:
+            raise FormatError(
+                "tells no frame rate, so it cannot be sampled by time; state "
+                "demonstrations.action_repeat"
+            )
+        return recording.frames_per_second * seconds
+
     try:
         read = foreign.read_episodes(
             path,
             num_episodes=num_episodes,
             image_size=image_size,
-            frame_skip=frame_skip,
-            max_bytes=max_bytes,
+            max_bytes=how.max_bytes,
+            takes_fewer=how.takes_fewer,
+            frame_skip=skip,
+            fit=how.fit,
+            camera=how.dataset_camera,
+            action_repeat=how.stated_action_repeat,
+            frames_per_step=frames_per_step if by_time else None,
         )
     except OSError as error:
         raise unreadable(path, error) from error
@@ -350,7 +404,10 @@ def _read_pixels(
 
 @functools.cache
 def _model_sizes(task: str) -> dict[str, int]:
-    """Returns the lengths of qpos, qvel, act and an action."""
-    with suite.make_environment(task, seed=0, observation="state") as environment:
-        sizes = {name: len(x) for name, x in environment.simulator_state().items()}
-        return {**sizes, "actions": environment.action_spec().shape[0]}
+    """Returns the lengths of an action, and of qpos, qvel and act if there are any."""
+    with tasks.make_environment(task, seed=0) as environment:
+        sizes = {"actions": environment.action_spec().shape[0]}
+        if isinstance(environment, Restorable):
+            states = environment.simulator_state()
+            sizes |= {name: len(array) for name, array in states.items()}
+        return sizes

@@ -1,42 +1,64 @@
-"""Records episodes of simulator states."""
+"""Records episodes as simulator states, or as pixels where a task has none."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
-from jaxil.environments.pixel_environment import PixelEnvironment
+from jaxil.demonstrations.readers.recording import PixelEpisode
 
 Decide = Callable[[int, np.ndarray], np.ndarray]  # step, observation -> action [A]
+Begin = Callable[[int], Decide]  # episode number -> its controller, after the reset
+Finished = Callable[[int, float], None]  # episode number, return
 
 
 def play(
-    environment: PixelEnvironment,
-    begin: Callable[[int], Decide],
+    environment: Any,
+    begin: Begin,
     num_episodes: int,
-    finished: Callable[[int, float], None] = lambda episode, task_return: None,
+    finished: Finished = lambda episode, task_return: None,
 ) -> dict[str, np.ndarray]:
     """Plays episodes 0 ... K - 1; returns the arrays of `StateDemonstrations`.
 
-    Args:
-      environment: used by nothing else.
-      begin: episode number -> its controller; called after the reset.
-      num_episodes: K.
-      finished: called with each episode's number and return.
+    `environment` is `Restorable`, and used by nothing else.
     """
     episodes = []
+    look = environment.simulator_state
+    for states, actions, rewards in _played(
+        environment, begin, num_episodes, finished, look
+    ):
+        played = {name: np.stack([each[name] for each in states]) for name in states[0]}
+        episodes.append({**played, "actions": actions, "rewards": rewards})
+    return {name: np.stack([each[name] for each in episodes]) for name in episodes[0]}
+
+
+def play_pixels(
+    environment: Any, begin: Begin, num_episodes: int, finished: Finished
+) -> Iterator[PixelEpisode]:
+    """Plays like `play`, in any environment; yields one episode at a time."""
+    for frames, actions, rewards in _played(
+        environment, begin, num_episodes, finished, environment.frame
+    ):
+        yield PixelEpisode(np.stack(frames), actions, rewards)
+
+
+def _played(
+    environment: Any,
+    begin: Begin,
+    num_episodes: int,
+    finished: Finished,
+    look: Callable[[], Any],
+) -> Iterator[tuple[list[Any], np.ndarray, np.ndarray]]:
+    """Yields what each episode looks like [N + 1], its actions and its rewards [N]."""
     for episode in range(num_episodes):
         timestep = environment.reset(episode=episode)
         decide = begin(episode)
-        states, actions, rewards = [environment.simulator_state()], [], []
+        seen, actions, rewards = [look()], [], []
         while not timestep.last():
             action = decide(len(actions), timestep.observation)
             actions.append(np.asarray(action, np.float32))
             timestep = environment.step(actions[-1])
             rewards.append(timestep.reward)
-            states.append(environment.simulator_state())
-        played = {name: np.stack([each[name] for each in states]) for name in states[0]}
-        played["actions"] = np.stack(actions)
-        played["rewards"] = np.asarray(rewards, np.float32)
-        episodes.append(played)
+            seen.append(look())
         finished(episode, sum(rewards))
-    return {name: np.stack([each[name] for each in episodes]) for name in episodes[0]}
+        yield seen, np.stack(actions), np.asarray(rewards, np.float32)

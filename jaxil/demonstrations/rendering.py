@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxil.environments import suite
-from jaxil.environments.pixel_environment import PixelEnvironment
+from jaxil.environments import suite, tasks
 from jaxil.environments.pool import interrupts_blocked
 from jaxil.files import archive
 from jaxil.machine.cache import cache_folder
@@ -45,6 +44,8 @@ def observe_episodes(
     image_size: int,
     render_quality: str,
     observation: str = "pixels",
+    camera: str = "",
+    distraction: str = "none",
     cache: bool = True,
     progress: Callable[[int, int], None] | None = None,
     processes: int | None = None,
@@ -76,8 +77,11 @@ def observe_episodes(
         "frame_stack": 1,
         "render_quality": render_quality,
         "observation": observation,
+        "camera": camera,
+        "distraction": distraction,
     }
-    with suite.make_environment(**settings) as environment:
+    with tasks.make_environment(**settings) as environment:
+        assert isinstance(environment, suite.SuiteEnvironment)
         spec = environment.observation_spec()
         num_episodes, length = states["qpos"].shape[:2]
         observed = np.empty((num_episodes, length, *spec.shape), spec.dtype)
@@ -92,11 +96,13 @@ def observe_episodes(
                 "seed": seed,
                 "image_size": image_size,
                 "render_quality": render_quality,
-                "camera": suite.camera_of(task),
+                "camera": camera or suite.camera_of(task),
                 "versions": suite.simulator_versions(),
                 "gl": environment.renderer.gl_name(),
                 "cache_version": _CACHE_VERSION,
             }
+            if distraction != "none":
+                about["distraction"] = distraction
             paths = [
                 _cache_path({**about, "episode": first_episode + index}, each)
                 for index, each in enumerate(of_episode)
@@ -155,7 +161,7 @@ def num_processes(num_pixels: int, gl_name: str) -> int:
 
 
 def _images(
-    environment: PixelEnvironment, number: int, states: States
+    environment: suite.SuiteEnvironment, number: int, states: States
 ) -> Iterator[np.ndarray]:
     """Yields the images of an episode, uint8 [H, W, 3].
 
@@ -237,13 +243,14 @@ def _render_episode(
 ) -> np.ndarray:
     """Renders an episode in another process: [N + 1, H, W, 3]."""
     environment = _own_environment(**settings)
+    assert isinstance(environment, suite.SuiteEnvironment)
     found = environment.renderer.gl_name()
     if found != gl_name:
         raise RuntimeError(f"rendered with {found}, not with {gl_name}")
     return np.stack(list(_images(environment, number, states)))
 
 
-_own_environment = functools.cache(suite.make_environment)
+_own_environment = functools.cache(tasks.make_environment)
 
 
 def _cache_path(about: dict[str, Any], states: States) -> pathlib.Path:

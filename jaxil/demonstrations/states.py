@@ -142,7 +142,11 @@ def recognises(path: pathlib.Path) -> bool:
 
 
 def read_states(
-    path: str | os.PathLike, *, task: str | None = None, num_episodes: int | None = None
+    path: str | os.PathLike,
+    *,
+    task: str | None = None,
+    num_episodes: int | None = None,
+    takes_fewer: bool = False,
 ) -> StateDemonstrations:
     """Reads and checks a whole file, without rendering.
 
@@ -150,6 +154,7 @@ def read_states(
       path: the file.
       task: the required task; None for any.
       num_episodes: returns the first ones; None for all.
+      takes_fewer: whether all will do, if there are fewer.
 
     Raises:
       DemonstrationError: the file cannot be read, is damaged, or does not fit.
@@ -171,11 +176,11 @@ def read_states(
     if task is not None and metadata["task"] != task:
         raise other_task(path, metadata["task"], task)
     stored = len(demonstrations.rewards)
-    if num_episodes is None:
+    if num_episodes is None or (takes_fewer and num_episodes >= stored):
         return demonstrations
     if not 1 <= num_episodes <= stored:
         what = f"holds {stored} episodes, but num_episodes={num_episodes}"
-        raise fault(path, what, f"Use 1 to {stored}")
+        raise fault(path, what, f"Use 1 to {stored} as demonstrations.num_episodes")
     kept = [array[:num_episodes] for array in demonstrations[:-1]]
     metadata = {**metadata, "returns": metadata["returns"][:num_episodes]}
     return StateDemonstrations(*kept, metadata=metadata)

@@ -1,4 +1,4 @@
-"""The interface of one simulator, and of several that run in parallel."""
+"""What the loop needs of one simulator, and of several that run in parallel."""
 
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -9,11 +9,20 @@ from dm_env import specs
 
 @runtime_checkable
 class Environment(Protocol):
-    """One simulator, stepped in agent steps; implemented by `PixelEnvironment`."""
+    """One simulator, stepped in agent steps: what training and evaluation need.
+
+    `PixelEnvironment` implements it for every kind of task. Tasks of dm_control are
+    `Restorable` too.
+    """
 
     @property
     def episode_steps(self) -> int | None:
         """Agent steps of a whole episode; None without a time limit."""
+        ...
+
+    @property
+    def decision_seconds(self) -> float | None:
+        """Simulated duration of an agent step; None if unknown."""
         ...
 
     def observation_spec(self) -> specs.Array:
@@ -29,12 +38,37 @@ class Environment(Protocol):
         ...
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
-        """Applies an action; the discount stays 1 at a time limit."""
+        """Applies an action; the discount is 1 at a time limit, 0 at a termination."""
         ...
 
     def single_observation(self) -> np.ndarray:
         """Returns the current frame, not stacked: uint8 [H, W, 3] or float32 [S]."""
         ...
+
+    def frame(self) -> np.ndarray:
+        """Returns the current image, uint8 [H, W, 3], for videos."""
+        ...
+
+    def renderer_name(self) -> str:
+        """Returns a few words on what renders its images."""
+        ...
+
+    def close(self) -> None:
+        """Frees the simulator."""
+
+
+@runtime_checkable
+class Restorable(Protocol):
+    """A simulator whose states can be stored, and rendered later."""
+
+    def simulator_state(self) -> dict[str, np.ndarray]:
+        """Returns arrays that determine the state, by name."""
+        ...
+
+    def set_simulator_state(
+        self, qpos: np.ndarray, qvel: np.ndarray, act: np.ndarray
+    ) -> None:
+        """Sets the simulation to a state from `simulator_state`."""
 
 
 class Moment(NamedTuple):

@@ -1,55 +1,68 @@
-"""A suite task as the agent sees it: agent steps, stacked images or states."""
+"""A task as the agent sees it: agent steps, stacked images or states."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import dm_env
 import numpy as np
 from dm_env import specs
+from PIL import Image
 
-from jaxil.environments.camera import Renderer
 from jaxil.replay.stacking import gather_stacks
 
 _UNBOUNDED = 1e9  # MuJoCo's value for an actuator without limits
 
 
 class PixelEnvironment(dm_env.Environment):
-    """A suite task as an `interaction.Environment`.
+    """Any dm_env environment as an `interaction.Environment`.
 
     One agent step is `action_repeat` environment frames. An observation is the last
     `frame_stack` images, uint8 [H, W, 3 * frame_stack], oldest first; at a reset the
-    first image is repeated. With `observation="state"` it is the suite's observation,
-    flattened, float32 [S], and nothing is rendered unless requested.
+    first image is repeated. With `observation="state"` it is the task's own
+    observation without images, flattened, float32 [S], and nothing is rendered unless
+    requested.
+
+    The image is the task's observation, if that is or holds one RGB image, else what
+    its `render()` returns; other sizes are scaled. Tasks may also offer
+    `seed(number)`, called before each reset, `step_limit` (frames of a whole episode)
+    and `frame_seconds`.
     """
 
     def __init__(
         self,
-        suite_environment: Any,
+        simulator: Any,
         *,
-        task: str,
         seed: int,
         action_repeat: int,
+        image_size: int,
         frame_stack: int,
         observation: str,
-        renderer: Renderer,
     ):
-        """Wraps `suite_environment`; arguments as for `make_environment`."""
-        self._suite_environment = suite_environment
-        self._name, self._seed = task, seed
+        """Wraps `simulator`, a dm_env.Environment; arguments as for `make_environment`.
+
+        Raises:
+          ValueError: its actions or observations cannot be used.
+        """
+        self._simulator, self._seed = simulator, seed
         self._action_repeat = action_repeat
+        self.image_size = image_size
         self._renders = observation == "pixels"
-        self.renderer = renderer
         self._next_episode = 0
         self._reset_next_step = True
+        self._seen: Any = None  # the task's own newest observation
         self._current: np.ndarray | None = None  # newest frame, once rendered
         self._frames: list[np.ndarray] = []  # of the observation
         self._frame_stack = frame_stack
-        bounds = suite_environment.action_spec()
-        bounded = np.abs(bounds.maximum) < _UNBOUNDED
-        self._action_low = np.where(bounded, bounds.minimum, -1.0)
-        self._action_half_range = (
-            np.where(bounded, bounds.maximum, 1.0) - self._action_low
-        ) / 2.0
+        bounds = simulator.action_spec()
+        if not isinstance(bounds, specs.BoundedArray) or len(bounds.shape) != 1:
+            raise ValueError(f"has actions {bounds}, but needs a bounded vector.")
+        low, high = (
+            np.broadcast_to(x, bounds.shape) for x in (bounds.minimum, bounds.maximum)
+        )
+        bounded = (np.abs(low) < _UNBOUNDED) & (np.abs(high) < _UNBOUNDED)
+        self._action_low = np.where(bounded, low, -1.0).astype(np.float64)
+        self._action_high = np.where(bounded, high, 1.0).astype(np.float64)
         self._action_spec = specs.BoundedArray(
             shape=bounds.shape,
             dtype=np.float32,
@@ -58,17 +71,18 @@ class PixelEnvironment(dm_env.Environment):
             name="action",
         )
         if self._renders:
-            size = renderer.image_size
             self._observation_spec: specs.Array = specs.BoundedArray(
-                shape=(size, size, 3 * frame_stack),
+                shape=(image_size, image_size, 3 * frame_stack),
                 dtype=np.uint8,
                 minimum=0,
                 maximum=255,
                 name="observation",
             )
         else:
-            parts = suite_environment.observation_spec().values()
+            parts = _states_in(simulator.observation_spec())
             state_dim = sum(math.prod(part.shape) for part in parts)
+            if state_dim == 0:
+                raise ValueError("observes images alone: set observation to 'pixels'.")
             self._observation_spec = specs.Array(
                 shape=(state_dim,), dtype=np.float32, name="observation"
             )
@@ -83,8 +97,7 @@ class PixelEnvironment(dm_env.Environment):
         if episode < 0:
             raise ValueError(f"episode={episode} must not be negative.")
         seeds = np.random.SeedSequence([self._seed, episode])
-        self._suite_environment.task.random.seed(seeds.generate_state(8))
-        self._suite_environment.reset()
+        self._seen = self._restart(seeds.generate_state(8)).observation
         self._next_episode = episode + 1
         self._reset_next_step = False
         self._current, self._frames = None, []
@@ -102,10 +115,12 @@ class PixelEnvironment(dm_env.Environment):
         expected = self._action_spec.shape
         if action.shape != expected:
             raise ValueError(f"action has shape {action.shape}, expected {expected}.")
-        control = self._action_low + (action + 1.0) * self._action_half_range
+        half_range = (self._action_high - self._action_low) / 2.0
+        control = self._action_low + (action + 1.0) * half_range
         reward, discount, is_last = 0.0, 1.0, False
         for _ in range(self._action_repeat):
-            inner = self._suite_environment.step(control)
+            inner = self._simulator.step(control)
+            self._seen = inner.observation
             reward += float(inner.reward)
             discount *= float(inner.discount)
             is_last = inner.last()
@@ -131,64 +146,69 @@ class PixelEnvironment(dm_env.Environment):
     def single_observation(self) -> np.ndarray:
         """Returns the current frame: uint8 [H, W, 3], or float32 [S] in state mode."""
         if self._current is None:
-            self._current = self.renderer.render() if self._renders else self._state()
+            self._current = self.render() if self._renders else self._state()
         return self._current.copy()
 
     def frame(self) -> np.ndarray:
         """Returns the current image, uint8 [H, W, 3], also in state mode."""
-        return self.single_observation() if self._renders else self.renderer.render()
+        return self.single_observation() if self._renders else self.render()
 
-    def simulator_state(self) -> dict[str, np.ndarray]:
-        """Returns copies of `qpos`, `qvel` and `act`, each float64 and 1-D."""
-        data = self.physics.data
-        return {
-            name: np.array(getattr(data, name), dtype=np.float64)
-            for name in ("qpos", "qvel", "act")
-        }
+    def render(self) -> np.ndarray:
+        """Returns a new image, uint8 [H, W, 3]."""
+        images = _images_in(self._seen)
+        image = images[0] if len(images) == 1 else self._rendered()
+        size = (self.image_size, self.image_size)
+        if image.shape[:2] == size:
+            return np.array(image)
+        # Pillow's bilinear filter grows with the scale, which prevents aliasing.
+        resized = Image.fromarray(image).resize(size, Image.Resampling.BILINEAR)
+        return np.array(resized)
 
-    def set_simulator_state(
-        self, qpos: np.ndarray, qvel: np.ndarray, act: np.ndarray
-    ) -> None:
-        """Sets the simulation to a state from `simulator_state`.
+    def renderer_name(self) -> str:
+        """Returns a few words on what renders the images."""
+        return "the task's own"
 
-        `frame` and `single_observation` show it at once, the stack after the next step.
-        Touch and acceleration sensors, which depend on the previous step's forces, are
-        computed without actuation.
-
-        Raises:
-          ValueError: an array does not have the model's shape.
-        """
-        data = self.physics.data
-        values = {"qpos": qpos, "qvel": qvel, "act": act}
-        for name, value in values.items():
-            given, shape = np.shape(value), getattr(data, name).shape
-            if given != shape:
-                what = f"{name} has shape {given}"
-                raise ValueError(f"{what}, but {self._name} needs {shape}.")
-        with self.physics.reset_context():
-            for name, value in values.items():
-                getattr(data, name)[:] = value
-        self._current = None
+    @property
+    def step_limit(self) -> float | None:
+        """Frames of a whole episode; None or infinity without a time limit."""
+        return getattr(self._simulator, "step_limit", None)
 
     @property
     def episode_steps(self) -> int | None:
         """Agent steps of a whole episode; None without a time limit."""
-        limit = self._suite_environment._step_limit
-        return None if math.isinf(limit) else math.ceil(limit / self._action_repeat)
+        limit = self.step_limit
+        if limit is None or math.isinf(limit):
+            return None
+        return math.ceil(limit / self._action_repeat)
 
     @property
-    def physics(self) -> Any:
-        """The dm_control `Physics`."""
-        return self._suite_environment.physics
+    def decision_seconds(self) -> float | None:
+        """Simulated duration of an agent step; None if unknown."""
+        seconds = getattr(self._simulator, "frame_seconds", None)
+        return None if seconds is None else seconds * self._action_repeat
 
     def close(self) -> None:
-        """Frees the simulation and its GL context."""
-        self.physics.free()
+        """Frees the simulation."""
+        self._simulator.close()
+
+    def _restart(self, seeds: np.ndarray) -> dm_env.TimeStep:
+        """Starts an episode that eight numbers determine."""
+        if hasattr(self._simulator, "seed"):
+            self._simulator.seed(int(seeds[0]))
+        return self._simulator.reset()
+
+    def _rendered(self) -> np.ndarray:
+        render = getattr(self._simulator, "render", None)
+        if render is None:
+            raise ValueError("neither observes one RGB image nor offers render().")
+        image = np.asarray(render())
+        if not _is_image(image):
+            shape = f"{image.dtype} {image.shape}"
+            raise ValueError(f"renders {shape}, but uint8 [H, W, 3] is expected.")
+        return image
 
     def _state(self) -> np.ndarray:
-        values = self._suite_environment.task.get_observation(self.physics).values()
-        flat = [np.ravel(value) for value in values]
-        return np.concatenate(flat).astype(np.float32)
+        return flat_state(self._seen)
 
     def _observe(self) -> np.ndarray:
         single = self.single_observation()
@@ -198,3 +218,29 @@ class PixelEnvironment(dm_env.Environment):
         self._frames = self._frames[-self._frame_stack :]
         indices = np.arange(self._frame_stack)[None]
         return gather_stacks(np.stack(self._frames), indices)[0]
+
+
+def flat_state(observation: Any) -> np.ndarray:
+    """Returns a task's own observation, without images, as float32 [S]."""
+    flat = [np.ravel(part) for part in _states_in(observation)]
+    return np.concatenate(flat).astype(np.float32)
+
+
+def _parts(observation: Any) -> list[Any]:
+    """Returns the arrays, or specs, of an observation."""
+    if not isinstance(observation, Mapping):
+        return [observation]
+    return [part for value in observation.values() for part in _parts(value)]
+
+
+def _is_image(array: Any) -> bool:
+    shape = getattr(array, "shape", ())
+    return len(shape) == 3 and shape[2] == 3 and array.dtype == np.uint8
+
+
+def _images_in(observation: Any) -> list[np.ndarray]:
+    return [part for part in _parts(observation) if _is_image(part)]
+
+
+def _states_in(observation: Any) -> list[Any]:
+    return [part for part in _parts(observation) if not _is_image(part)]

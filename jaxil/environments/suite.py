@@ -9,8 +9,12 @@ import importlib.metadata
 import os
 from typing import Any
 
+import dm_env
+import numpy as np
+
 from jaxil.environments.camera import RENDER_QUALITIES, Renderer
-from jaxil.environments.pixel_environment import PixelEnvironment
+from jaxil.environments.distraction import STRENGTHS, Distraction
+from jaxil.environments.pixel_environment import PixelEnvironment, flat_state
 from jaxil.machine import startup
 
 OBSERVATIONS = ("pixels", "state")
@@ -67,7 +71,7 @@ def split_task(task: str) -> tuple[str, str]:
 
 def camera_of(task: str) -> int:
     """Returns the index of the camera that DrQ-v2 uses (dmc.py)."""
-    return 2 if split_task(task)[0] == "quadruped" else 0
+    return 2 if task.startswith("quadruped_") else 0
 
 
 @functools.cache
@@ -84,6 +88,103 @@ def simulator_versions() -> dict[str, str]:
     }
 
 
+class SuiteEnvironment(PixelEnvironment):
+    """A task of dm_control, whose states can be stored and rendered later."""
+
+    def __init__(
+        self,
+        simulator: Any,
+        *,
+        image_size: int,
+        camera: int = 0,
+        distraction: str = "none",
+        render_quality: str = "paper",
+        **settings: Any,
+    ):
+        """Wraps an environment of `dm_control`; see `make_environment`."""
+        super().__init__(simulator, image_size=image_size, **settings)
+        self.renderer = Renderer(
+            simulator.physics,
+            open_camera=_open_camera,
+            image_size=image_size,
+            camera=camera,
+            render_quality=render_quality,
+        )
+        self._distraction = Distraction(simulator.physics, camera, distraction)
+
+    def render(self) -> np.ndarray:
+        """Returns a new image, uint8 [H, W, 3]; RuntimeError without usable GL."""
+        if self._distraction.is_on:
+            self.renderer.gl_name()  # opens the context
+            self._distraction.upload()
+        return self.renderer.render()
+
+    def renderer_name(self) -> str:
+        """Returns GL's name of the rendering device."""
+        return self.renderer.gl_name()
+
+    def simulator_state(self) -> dict[str, np.ndarray]:
+        """Returns copies of `qpos`, `qvel` and `act`, each float64 and 1-D."""
+        data = self.physics.data
+        return {
+            name: np.array(getattr(data, name), dtype=np.float64)
+            for name in ("qpos", "qvel", "act")
+        }
+
+    def set_simulator_state(
+        self, qpos: np.ndarray, qvel: np.ndarray, act: np.ndarray
+    ) -> None:
+        """Sets the simulation to a state from `simulator_state`.
+
+        `frame` and `single_observation` show it at once, the stack after the next step.
+        Touch and acceleration sensors, which depend on the previous step's forces, are
+        computed without actuation.
+
+        Raises:
+          ValueError: an array does not have the model's shape.
+        """
+        data = self.physics.data
+        values = {"qpos": qpos, "qvel": qvel, "act": act}
+        for name, value in values.items():
+            given, shape = np.shape(value), getattr(data, name).shape
+            if given != shape:
+                what = f"{name} has shape {given}"
+                raise ValueError(f"{what}, but the task needs {shape}.")
+        with self.physics.reset_context():
+            for name, value in values.items():
+                getattr(data, name)[:] = value
+        self._current = None
+
+    @property
+    def step_limit(self) -> float:
+        """Frames of a whole episode; infinity without a time limit."""
+        return self._simulator._step_limit
+
+    @property
+    def decision_seconds(self) -> float:
+        """Simulated duration of an agent step."""
+        return self._simulator.control_timestep() * self._action_repeat
+
+    @property
+    def physics(self) -> Any:
+        """The dm_control `Physics`."""
+        return self._simulator.physics
+
+    def close(self) -> None:
+        """Frees the simulation and its GL context."""
+        self.physics.free()
+
+    def _restart(self, seeds: np.ndarray) -> dm_env.TimeStep:
+        self._simulator.task.random.seed(seeds)
+        if self._distraction.is_on:
+            self._distraction.restart(seeds)
+        return self._simulator.reset()
+
+    def _state(self) -> np.ndarray:
+        # Not the step's own, which a new simulator state does not change.
+        return flat_state(self._simulator.task.get_observation(self.physics))
+
+
 def make_environment(
     task: str,
     *,
@@ -93,7 +194,9 @@ def make_environment(
     frame_stack: int = 3,
     render_quality: str = "paper",
     observation: str = "pixels",
-) -> PixelEnvironment:
+    camera: str = "",
+    distraction: str = "none",
+) -> SuiteEnvironment:
     """Makes the environment of `task`.
 
     Args:
@@ -104,6 +207,11 @@ def make_environment(
       frame_stack: images per observation; ignored for states.
       render_quality: "paper", "fast" or "smooth".
       observation: "pixels" or "state".
+      camera: its name or index; "" for the one of DrQ-v2.
+      distraction: one of `distraction.STRENGTHS`.
+
+    Raises:
+      ValueError: one of these is unknown or out of range.
     """
     for name, value, least in (
         ("seed", seed, 0),
@@ -116,28 +224,49 @@ def make_environment(
     for name, value, known in (
         ("observation", observation, OBSERVATIONS),
         ("render_quality", render_quality, RENDER_QUALITIES),
+        ("distraction", distraction, STRENGTHS),
     ):
         if value not in known:
             names = ", ".join(known)
             raise ValueError(f"{name}={value!r} is unknown; choose one of: {names}.")
-    domain, name = split_task(task)
-    suite_environment = _suite().load(domain, name, task_kwargs={"random": seed})
-    renderer = Renderer(
-        suite_environment.physics,
-        open_camera=_open_camera,
-        image_size=image_size,
-        camera=camera_of(task),
-        render_quality=render_quality,
-    )
-    return PixelEnvironment(
-        suite_environment,
-        task=task,
+    simulator = _suite().load(*split_task(task), task_kwargs={"random": seed})
+    return wrap(
+        simulator,
+        default_camera=camera_of(task),
         seed=seed,
         action_repeat=action_repeat,
+        image_size=image_size,
         frame_stack=frame_stack,
         observation=observation,
-        renderer=renderer,
+        render_quality=render_quality,
+        camera=camera,
+        distraction=distraction,
     )
+
+
+def wrap(
+    simulator: Any, *, camera: str, default_camera: int = 0, **settings: Any
+) -> SuiteEnvironment:
+    """Makes one of an environment of dm_control; see `make_environment`."""
+    index = camera_index(simulator.physics.model, camera, default_camera)
+    return SuiteEnvironment(simulator, camera=index, **settings)
+
+
+def camera_index(model: Any, camera: str, default: int = 0) -> int:
+    """Returns the index of a camera by its name or number.
+
+    Raises:
+      ValueError: the model has none like that.
+    """
+    if not camera:
+        return default
+    names = [model.id2name(index, "camera") for index in range(model.ncam)]
+    numbers = [str(index) for index in range(model.ncam)]
+    for known in (names, numbers):
+        if camera in known:
+            return known.index(camera)
+    listed = ", ".join(f"{i} {n}".strip() for i, n in zip(numbers, names))
+    raise ValueError(f"camera={camera!r} is unknown; the task has: {listed}.")
 
 
 def _open_camera(physics: Any, size: int, index: int) -> Any:

@@ -87,14 +87,10 @@ class Bench:
 
     def parts(self) -> dict[str, tuple[Callable[[], Any], int]]:
         """Returns the parts of a run by name, and how often one call executes each."""
-        run, config = self.run, self.config
-        is_state = config.observation == "state"
-        render = (
-            self._environment.frame if is_state else self._environment.renderer.render
-        )
+        run = self.run
         return {
             "physics_ms": (self._physics_step(), 1),
-            "render_ms": (render, 1),
+            "render_ms": (self._environment.render, 1),
             "act_ms": (lambda: run.act(self.observation[None]), 1),
             "sample_ms": (self.sample, 1),
             "update_ms": (self.update, self._several),

@@ -21,13 +21,13 @@ import json, os, sys, time
 from jaxil.machine import startup
 startup.prepare()
 from jaxil import command, launch
-from jaxil.environments import suite
+from jaxil.environments.pixel_environment import PixelEnvironment
 
 def step(self, action):
     print(json.dumps(time.monotonic()), flush=True)
     os._exit(0)
 
-suite.PixelEnvironment.step = step
+PixelEnvironment.step = step
 command.run(launch.main)
 """
 _CONFIG_FILE = """

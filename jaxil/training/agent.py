@@ -9,7 +9,7 @@ import optax
 from jaxil import methods
 from jaxil.config import Config
 from jaxil.demonstrations import loading
-from jaxil.environments.suite import PixelEnvironment
+from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.learner.gathering import Step, make_gathering_step, make_repeated_step
 from jaxil.learner.policy import (
     MeanAction,

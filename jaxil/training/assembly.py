@@ -11,9 +11,12 @@ from jaxil import methods
 from jaxil.config import Config
 from jaxil.demonstrations import loading
 from jaxil.demonstrations.states import DemonstrationError
+from jaxil.environments import tasks
+from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.environments.player import InProcess, Player
 from jaxil.environments.pool import Pool
-from jaxil.environments.suite import PixelEnvironment, known_tasks, make_environment
+from jaxil.environments.suite import known_tasks
+from jaxil.environments.tasks import make_environment
 from jaxil.errors import Fault, UsageError
 from jaxil.machine import memory
 from jaxil.machine.progress import ProgressLine
@@ -41,6 +44,10 @@ def problems(config: Config) -> list[Fault]:
     """
     faults = jaxil_config.problems(config, known_tasks())
     bad = {fault.subject.partition(".")[0] for fault in faults}
+    if not bad & {"task", *_environment_settings(config)}:
+        found = tasks.problems(config.task, **_environment_settings(config))
+        faults += found
+        bad |= {fault.subject for fault in found}
     if config.encoder.convolutions == "native" and "encoder" not in bad:
         fault = native_fault(config) or build.problem()
         if fault is not None:
@@ -81,7 +88,7 @@ def renderer_name(config: Config) -> str:
     """
     with training_environment(config) as environment:
         try:
-            return environment.renderer.gl_name()
+            return environment.renderer_name()
         except RuntimeError as error:
             if config.observation == "state" and not config.video_every_evals:
                 return "none"
@@ -154,6 +161,8 @@ def _environment_settings(config: Config) -> dict[str, Any]:
         "frame_stack": config.frame_stack,
         "render_quality": config.render_quality,
         "observation": config.observation,
+        "camera": config.camera,
+        "distraction": config.distraction,
     }
 
 
@@ -184,6 +193,8 @@ def load_demonstrations(
         return loading.load(
             config.demonstrations.source,
             render_quality=config.render_quality,
+            camera=config.camera,
+            distraction=config.demonstrations.distraction,
             progress=show,
             **_file_settings(config),
         )
@@ -194,13 +205,20 @@ def load_demonstrations(
 
 def _file_settings(config: Config) -> dict[str, Any]:
     """Returns what decides whether a demonstration file can serve a run."""
+    settings = config.demonstrations
+    usual = jaxil_config.FIELDS["demonstrations.num_episodes"].default
     return {
         "task": config.task,
-        "num_episodes": config.demonstrations.num_episodes,
+        "num_episodes": settings.num_episodes,
+        "takes_fewer": bool(settings.source) and settings.num_episodes == usual,
+        "sampling": settings.sampling,
+        "fit": settings.fit,
+        "stated_action_repeat": settings.action_repeat,
+        "dataset_camera": settings.camera,
         "action_repeat": config.action_repeat,
         "image_size": config.image_size,
         "observation": config.observation,
-        "frame_skip": config.demonstrations.frame_skip,
+        "frame_skip": settings.frame_skip,
         "max_bytes": memory.spare_bytes(),
     }
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxil.config import Config
 from jaxil.environments.evaluation import Evaluation, Stopped, evaluate
-from jaxil.environments.suite import PixelEnvironment
+from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.learner.state import TrainState
 from jaxil.maths.types import Episode, ExpertEpisodes
 from jaxil.training.agent import Agent

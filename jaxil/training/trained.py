@@ -11,7 +11,7 @@ from jaxil import config as jaxil_config
 from jaxil.config import Config
 from jaxil.demonstrations import loading
 from jaxil.demonstrations.states import DemonstrationError
-from jaxil.environments.suite import PixelEnvironment
+from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.errors import UsageError
 from jaxil.learner.policy import make_mean_action
 from jaxil.learner.state import LearnerParams
@@ -101,7 +101,7 @@ def load_policy(folder: str | os.PathLike) -> Policy:
     """
     devices.device_name()  # a wrong JAX_PLATFORMS is said first
     folder = pathlib.Path(folder).expanduser()
-    config = workdir.read_config(folder)
+    config = workdir.read_config(folder, trusted=None)
     faults = jaxil_config.problems(config, known_tasks=(config.task,))
     if faults:
         raise UsageError(f"{folder / 'config.json'}: {'; '.join(map(str, faults))}")
@@ -135,6 +135,7 @@ def load(folder: str | os.PathLike) -> Trained:
     Raises:
       UsageError: see `load_policy`.
     """
+    workdir.read_config(pathlib.Path(folder))  # whose task is imported below
     policy = load_policy(folder)
     config, demonstrations = policy.config, None
     try:

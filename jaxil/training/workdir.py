@@ -9,9 +9,11 @@ from collections.abc import Iterator
 from typing import Any
 
 from jaxil import config as jaxil_config
+from jaxil import outside
 from jaxil.config import Config, default_config
 from jaxil.demonstrations import loading
 from jaxil.demonstrations.states import DemonstrationError
+from jaxil.environments import tasks
 from jaxil.errors import Fault, UsageError
 from jaxil.files import locking, writing
 from jaxil.files.settings import as_stored, flat
@@ -74,7 +76,7 @@ def problems(workdir: pathlib.Path, config: Config) -> list[Fault]:
     if not (workdir / "config.json").exists():
         return []
     try:
-        before = read_config(workdir)
+        before = read_config(workdir, trusted=config.task)
     except UsageError as error:
         return [Fault("workdir", f"cannot be resumed: {error}", value=str(workdir))]
     different = _differences(before, config)
@@ -157,8 +159,11 @@ def newest_checkpoint(workdir: pathlib.Path) -> int | None:
     return max((int(match[1]) for match in matches), default=None)
 
 
-def read_config(workdir: pathlib.Path) -> Config:
+def read_config(workdir: pathlib.Path, *, trusted: str | None = "") -> Config:
     """Returns the config of the run in a folder.
+
+    Where it names a module of the user's own, so must the command line, unless
+    `trusted` is that name, or None, for those who import no task.
 
     Fields that did not exist when it was written have their defaults: these are what
     was done before there was a choice. Those that no longer exist are left out.
@@ -169,7 +174,10 @@ def read_config(workdir: pathlib.Path) -> Config:
     path = workdir / "config.json"
     try:
         stored = _read_json(path)["config"]
-        config = default_config(stored["method"], stored["task"])
+        task = str(stored["task"])
+        if tasks.names_code(task) and trusted not in (task, None):
+            outside.require_named(task, "task", path)
+        config = default_config(stored["method"], task)
         known = jaxil_config.fields(stored["method"])
         there = flat(stored)
         for field in known.keys() & there.keys():

@@ -39,18 +39,19 @@ def random_actions(environment, number, seed=0):
     return np.random.default_rng(seed).uniform(-1, 1, shape).astype(np.float32)
 
 
-class CountdownSuite:
-    """Stands for a suite environment: rewards 1, 2, 4, 8, 16, and then the end."""
+class Countdown:
+    """Rewards 1, 2, 4, 8, 16, and then the end."""
+
+    step_limit = 5
 
     def __init__(self, last_discount=0.0):
-        self.task, self.physics, self._step_limit = self, self, 5
-        self.random = np.random.RandomState(0)
         self.last_discount = last_discount
         self.controls = []
+        self.seen = {"position": np.array([[1.0, 2.0]]), "height": np.float64(3.0)}
 
     def reset(self):
         self.controls = []
-        return dm_env.restart(None)
+        return dm_env.restart(self.seen)
 
     def step(self, control):
         self.controls.append(control)
@@ -58,13 +59,9 @@ class CountdownSuite:
         reward = 2.0 ** (number - 1)
         if number == 5:
             return dm_env.TimeStep(
-                dm_env.StepType.LAST, reward, self.last_discount, None
+                dm_env.StepType.LAST, reward, self.last_discount, self.seen
             )
-        return dm_env.TimeStep(dm_env.StepType.MID, reward, 0.5, None)
-
-    def get_observation(self, physics):
-        assert physics is self
-        return {"position": np.array([[1.0, 2.0]]), "height": np.float64(3.0)}
+        return dm_env.TimeStep(dm_env.StepType.MID, reward, 0.5, self.seen)
 
     def observation_spec(self):
         return {
@@ -76,15 +73,14 @@ class CountdownSuite:
         return specs.BoundedArray((2,), np.float64, [0.0, -1e10], [10.0, 1e10])
 
 
-def countdown(last_discount=0.0) -> PixelEnvironment:
+def countdown(simulator=None) -> PixelEnvironment:
     return PixelEnvironment(
-        CountdownSuite(last_discount),
-        task="countdown",
+        simulator or Countdown(),
         seed=0,
         action_repeat=2,
+        image_size=SIZE,
         frame_stack=3,
         observation="state",
-        renderer=None,  # type: ignore[arg-type]  # states are never drawn
     )
 
 
@@ -136,11 +132,12 @@ def test_tasks_that_end_by_themselves_have_no_length():
 
 
 def test_actions_are_rescaled_to_the_tasks_bounds():
-    environment = countdown()
+    simulator = Countdown()
+    environment = countdown(simulator)
     environment.reset()
     environment.step(np.array([-1.0, -1.0]))
     environment.step(np.array([1.0, 0.25]))
-    controls = environment.physics.controls
+    controls = simulator.controls
     # [0, 10] is filled; an actuator without bounds gets the action as it is.
     np.testing.assert_allclose(controls[0], [0.0, -1.0])
     np.testing.assert_allclose(controls[2], [10.0, 0.25])

@@ -1,0 +1,205 @@
+"""Makes the environment of any task by its name.
+
+    cartpole_swingup           of the DeepMind Control Suite
+    gymnasium:ID               of Gymnasium, with continuous actions
+    package.module:function    of the user: returns a dm_env.Environment
+
+Environments of the user that dm_control made can do whatever the suite's can.
+"""
+
+import atexit
+import functools
+from typing import Any
+
+import dm_env
+import numpy as np
+from dm_env import specs
+
+from jaxil import outside
+from jaxil.environments import suite
+from jaxil.environments.pixel_environment import PixelEnvironment
+from jaxil.errors import Fault, UsageError
+
+_GYMNASIUM = "gymnasium:"
+_DEFAULTS = {
+    "action_repeat": 2,
+    "frame_stack": 3,
+    "observation": "pixels",
+    "render_quality": "paper",
+    "camera": "",
+    "distraction": "none",
+}
+_OF_DM_CONTROL = ("render_quality", "camera", "distraction")
+
+
+def is_of_suite(task: str) -> bool:
+    """Returns whether a name is meant for the control suite."""
+    return ":" not in task
+
+
+def names_code(task: str) -> bool:
+    """Returns whether a task's name makes Python import a module that it names."""
+    return ":" in task.removeprefix(_GYMNASIUM)
+
+
+def problems(task: str, **settings: Any) -> list[Fault]:
+    """Tries a task: makes it, resets it, takes a step, and looks at it.
+
+    Args:
+      task: with `gymnasium:` or of the user; any of the suite is only made if its
+        camera has to be looked up.
+      settings: those of `make_environment`.
+    """
+    if is_of_suite(task) and not settings["camera"]:
+        return []
+    try:
+        environment = make_environment(task, seed=0, **settings)
+        if not is_of_suite(task):
+            environment.reset(episode=0)
+            environment.step(np.zeros(environment.action_spec().shape))
+            if settings["observation"] == "pixels":
+                environment.frame()
+        environment.close()
+    except UsageError as error:
+        return [f if isinstance(f, Fault) else Fault("task", f) for f in error.faults]
+    except Exception as error:  # whatever the user's task raises
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+        return [Fault("task", f"cannot be used: {kind}{error}", value=task)]
+    return []
+
+
+def make_environment(
+    task: str, *, seed: int, image_size: int = 84, **settings: Any
+) -> PixelEnvironment:
+    """Makes the environment of `task`; other arguments as for the suite's.
+
+    `render_quality`, `camera` and `distraction` are the suite's alone.
+
+    Raises:
+      UsageError: there is no such task, or a package is missing.
+      ValueError: a setting is out of range, or the task cannot be used.
+    """
+    if is_of_suite(task):
+        return suite.make_environment(
+            task, seed=seed, image_size=image_size, **settings
+        )
+    if task.startswith(_GYMNASIUM):
+        simulator: Any = _Gymnasium(task.removeprefix(_GYMNASIUM), image_size)
+    else:
+        simulator = outside.load(task, "task")()
+    settings = {**_DEFAULTS, **settings, "seed": seed, "image_size": image_size}
+    own_task = getattr(simulator, "task", None)
+    if isinstance(getattr(own_task, "random", None), np.random.RandomState):
+        return suite.wrap(simulator, **settings)
+    for name in _OF_DM_CONTROL:
+        value = settings.pop(name)
+        if name != "render_quality" and value != _DEFAULTS[name]:
+            raise UsageError(Fault(name, "is for tasks of dm_control", value=value))
+    return PixelEnvironment(simulator, **settings)
+
+
+@functools.cache
+def timing(task: str, action_repeat: int) -> tuple[float | None, int | None]:
+    """Returns an agent step's seconds, and an episode's steps; None if unknown."""
+    settings = {"action_repeat": action_repeat, "image_size": 8}
+    environment = make_environment(task, seed=0, **settings)
+    found = environment.decision_seconds, environment.episode_steps
+    environment.close()
+    return found
+
+
+class _Gymnasium(dm_env.Environment):
+    """An environment of Gymnasium as one of dm_env.
+
+    A termination has discount 0, a truncation 1.
+    """
+
+    def __init__(self, name: str, image_size: int) -> None:
+        try:
+            import gymnasium
+        except ImportError as error:
+            raise UsageError(
+                Fault(
+                    "task",
+                    "needs Gymnasium, which is not installed",
+                    "in jaxil's folder: pip install '.[gymnasium]'",
+                    _GYMNASIUM + name,
+                )
+            ) from error
+        make = functools.partial(
+            gymnasium.make, name, render_mode="rgb_array", disable_env_checker=True
+        )
+        try:
+            try:  # MuJoCo's render at any size
+                self._inner = make(width=image_size, height=image_size)
+            except TypeError:
+                self._inner = make()
+        except (gymnasium.error.Error, ImportError) as error:
+            raise UsageError(
+                Fault("task", f"cannot be made: {error}", value=_GYMNASIUM + name)
+            ) from error
+        space: Any = self._inner.action_space
+        if not isinstance(space, gymnasium.spaces.Box):
+            raise ValueError(
+                f"has actions {space}, but needs a vector of numbers (Box)"
+            )
+        self._space = space
+        observed: Any = self._inner.observation_space
+        self._observed = _spec_of(observed)
+        spec, inner = self._inner.spec, self._inner.unwrapped
+        self.step_limit = spec and spec.max_episode_steps
+        rate = inner.metadata.get("render_fps")
+        self.frame_seconds = getattr(inner, "dt", None) or (rate and 1.0 / rate)
+        self._next_seed: int | None = None
+        self._is_rendered = False
+
+    def seed(self, number: int) -> None:
+        """Determines the next reset."""
+        self._next_seed = number
+
+    def reset(self) -> dm_env.TimeStep:
+        """Starts an episode."""
+        observation, _ = self._inner.reset(seed=self._next_seed)
+        return dm_env.restart(observation)
+
+    def step(self, action: np.ndarray) -> dm_env.TimeStep:
+        """Applies an action within the bounds."""
+        action = np.clip(action, self._space.low, self._space.high)
+        observation, reward, terminated, truncated, _ = self._inner.step(
+            action.astype(self._space.dtype)
+        )
+        if terminated:
+            return dm_env.termination(float(reward), observation)
+        if truncated:
+            return dm_env.truncation(float(reward), observation)
+        return dm_env.transition(float(reward), observation)
+
+    def render(self) -> Any:
+        """Returns the current image."""
+        image = self._inner.render()
+        if not self._is_rendered:
+            # At the interpreter's end the GL library, which is open now, goes first.
+            atexit.register(self.close)
+            self._is_rendered = True
+        return image
+
+    def action_spec(self) -> specs.BoundedArray:  # pyright: ignore
+        """Returns the bounds of actions."""
+        space = self._space
+        return specs.BoundedArray(space.shape, space.dtype, space.low, space.high)
+
+    def observation_spec(self) -> Any:
+        """Returns specs of a vector, an image, or a dictionary of them."""
+        return self._observed
+
+    def close(self) -> None:
+        """Frees the simulation."""
+        atexit.unregister(self.close)
+        self._inner.close()
+
+
+def _spec_of(space: Any) -> Any:
+    """Returns the spec of a Box, of a dictionary of them, or of anything else."""
+    if hasattr(space, "spaces") and hasattr(space.spaces, "items"):
+        return {name: _spec_of(part) for name, part in space.spaces.items()}
+    return specs.Array(space.shape or (), space.dtype or np.float32)

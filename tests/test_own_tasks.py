@@ -1,0 +1,203 @@
+"""Tasks that are not of the control suite, as people type them."""
+
+import csv
+import os
+import textwrap
+
+import numpy as np
+import pytest
+
+from jaxil import collect
+from jaxil.demonstrations import foreign
+from tests.commands import ROOT, run, small
+
+# A package of one file, as a user would write it: a light that can be pushed around.
+_OWN = """
+import dm_env
+import numpy as np
+from dm_env import specs
+
+
+class Light(dm_env.Environment):
+    step_limit = 12
+
+    def __init__(self):
+        self.rng = np.random.default_rng(0)
+
+    def seed(self, number):
+        self.rng = np.random.default_rng(number)
+
+    def reset(self):
+        self.place, self.time = self.rng.uniform(-1.0, 1.0), 0
+        return dm_env.restart(self.image())
+
+    def step(self, action):
+        self.time += 1
+        self.place = float(np.clip(self.place + action[0] / 10, -1.0, 1.0))
+        reward = 1.0 - abs(self.place)
+        if self.time == self.step_limit:
+            return dm_env.truncation(reward, self.image())
+        return dm_env.transition(reward, self.image())
+
+    def image(self):
+        image = np.zeros((20, 30, 3), np.uint8)
+        column = round((self.place + 1.0) / 2.0 * 24)
+        image[8:14, column : column + 6] = 255
+        return image
+
+    def observation_spec(self):
+        return specs.Array((20, 30, 3), np.uint8)
+
+    def action_spec(self):
+        return specs.BoundedArray((1,), np.float64, -2.0, 2.0)
+
+
+def make():
+    return Light()
+
+
+def centre(image):
+    columns = np.nonzero(image.max(axis=(0, 2)) > 100)[0]
+    return np.clip([1.0 - columns.mean() * 2.0 / image.shape[1]], -1.0, 1.0)
+
+
+def balance(state):
+    return np.clip([0.5 * state[1] + 0.3 * state[3]], -1.0, 1.0)
+"""
+_SIZES = (
+    "--config.action_repeat=2",
+    "--config.seed_frames=40",
+    "--config.exploration_steps=10",
+    "--config.eval_every_frames=40",
+    "--config.checkpoint_every_frames=40",
+)
+
+
+@pytest.fixture(autouse=True)
+def _package(tmp_path, monkeypatch):
+    (tmp_path / "light.py").write_text(textwrap.dedent(_OWN))
+    monkeypatch.syspath_prepend(tmp_path)
+    path = os.pathsep.join((str(tmp_path), str(ROOT)))
+    monkeypatch.setenv("PYTHONPATH", path)
+
+
+def rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize(
+    ("task", "policy"),
+    [
+        ("gymnasium:InvertedPendulum-v5", "light:balance"),
+        ("light:make", "light:centre"),
+    ],
+)
+def test_a_task_from_outside_is_recorded_trained_resumed_and_shown(
+    task, policy, tmp_path, capsys
+):
+    expert, workdir = tmp_path / "expert.npz", tmp_path / "runs" / "1"
+    collect.main(
+        [
+            "collect",
+            f"--policy={policy}",
+            f"--task={task}",
+            f"--output={expert}",
+            "--num_episodes=2",
+            "--image_size=24",
+        ]
+    )
+    assert "2 episodes" in capsys.readouterr().out
+    recording = foreign.open_recording(expert, max_bytes=2**24)
+    assert (recording.task, recording.action_repeat) == (task, 2)
+    episode = next(recording.episodes)
+    assert episode.frames.shape[1:] == (24, 24, 3)
+    assert episode.frames.std() > 0
+    assert episode.actions is not None
+
+    flags = (
+        f"--config=configs/tiny.py:zero,{task}",
+        f"--workdir={workdir}",
+        *small("zero"),
+        *_SIZES,
+        f"--config.demonstrations.source={expert}",
+    )
+    for total in (60, 120):
+        finished = run(
+            "launch", *flags, f"--config.total_frames={total}", timeout=600.0
+        )
+        assert finished.returncode == 0, finished.stderr
+    assert "resuming from the checkpoint" in finished.stderr
+    frames = [int(row["frame"]) for row in rows(workdir / "train.csv")]
+    assert frames == sorted(set(frames))
+    assert frames[-1] >= 120
+    assert list((workdir / "videos").glob("frame_*.mp4"))
+    assert float(rows(workdir / "eval.csv")[-1]["expert_task_return_mean"]) > 0
+
+    evaluated = run("evaluate", f"--workdir={workdir}", "--num_episodes=1")
+    if task.startswith("gymnasium"):
+        assert evaluated.returncode == 0, evaluated.stderr
+    else:  # the folder alone may not make Python import anything
+        assert evaluated.returncode == 2
+        assert f"--trust={task}" in evaluated.stderr
+        trusted = (f"--workdir={workdir}", "--num_episodes=1", f"--trust={task}")
+        evaluated = run("evaluate", *trusted)
+        assert evaluated.returncode == 0, evaluated.stderr
+    assert "the expert's mean" in evaluated.stdout
+    reported = run("report", str(workdir.parent), f"--output={tmp_path / 'report'}")
+    assert reported.returncode == 0, reported.stderr
+    assert task in (tmp_path / "report" / "report.html").read_text()
+
+
+def test_faults_of_tasks_are_one_message_each(tmp_path):
+    for task, words in (
+        ("gymnasium:Hoper-v5", "Hopper"),
+        ("gymnasium:CartPole-v1", "Discrete"),
+        ("light:nothing", "has no attribute 'nothing'"),
+        ("no_such_module:make", "PYTHONPATH"),
+        ("light:centre", "missing 1 required positional argument"),
+    ):
+        found = _problems(task)
+        assert len(found) == 1
+        assert words in found[0], found
+    assert "dm_control" in _problems("light:make", camera="side")[0]
+    del tmp_path
+
+
+def _problems(task, **changes):
+    from jaxil.environments import tasks
+
+    settings = {
+        "image_size": 24,
+        "observation": "pixels",
+        "render_quality": "paper",
+        "camera": "",
+        "distraction": "none",
+    }
+    return [str(fault) for fault in tasks.problems(task, **(settings | changes))]
+
+
+def test_pixels_are_scaled_and_starts_depend_on_seed_and_number_alone():
+    from jaxil.environments import tasks
+
+    environment = tasks.make_environment("light:make", seed=3, image_size=16)
+    starts = [environment.reset(episode=episode).observation for episode in (5, 6, 5)]
+    assert starts[0].shape == (16, 16, 9)
+    np.testing.assert_array_equal(starts[0], starts[2])
+    assert not np.array_equal(starts[0], starts[1])
+
+
+@pytest.mark.parametrize(
+    ("task", "discount"),
+    [("gymnasium:InvertedPendulum-v5", 0.0), ("gymnasium:Reacher-v5", 1.0)],
+)
+def test_a_termination_has_discount_zero_and_a_truncation_one(task, discount):
+    from jaxil.environments import tasks
+
+    environment = tasks.make_environment(task, seed=0, observation="state")
+    step = environment.reset(episode=0)
+    while not step.last():
+        assert step.discount in (None, 1.0)
+        step = environment.step(np.ones(environment.action_spec().shape))
+    assert step.discount == discount
+    environment.close()
