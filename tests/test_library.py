@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 
+import jaxil
 from tests import own_loop
 from tests.commands import ROOT, arguments
 
@@ -54,6 +55,23 @@ def test_states_need_no_opengl():
     assert _python(_STATES.format("state"), **no_display).stdout == "(5,)\n"
     failed = _python(_STATES.format("pixels"), **no_display)
     assert "MUJOCO_GL=glfw does not work here (there is no display)" in failed.stderr
+
+
+@pytest.mark.parametrize(("most_frames", "steps"), [(0, 125), (20, 3)])
+def test_tasks_without_a_time_limit_end(most_frames, steps):
+    environment = jaxil.make_environment(
+        "lqr_lqr_2_1",
+        seed=0,
+        observation="state",
+        action_repeat=8,
+        max_episode_frames=most_frames,
+    )
+    assert environment.episode_steps == steps
+    timestep, played = environment.reset(), 0
+    while not timestep.last():
+        played += 1
+        timestep = environment.step(np.zeros(environment.action_spec().shape))
+    assert (played, timestep.discount) == (steps, 1.0)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from typing import Any
 from jaxil import config as jaxil_config
 from jaxil import outside
 from jaxil.config import Config, default_config
-from jaxil.demonstrations import loading
+from jaxil.demonstrations import states
 from jaxil.demonstrations.states import DemonstrationError
 from jaxil.environments import tasks
 from jaxil.errors import Fault, UsageError
@@ -216,7 +216,9 @@ def write_config(
 def demonstrations_digest(config: Config) -> str | None:
     """Returns a digest of what the demonstrations' file holds; None if unreadable."""
     try:
-        return loading.digest(config.demonstrations.source, config.task)
+        source = config.demonstrations.source
+        path = pathlib.Path(source) if source else states.shipped_path(config.task)
+        return states.digest(path.expanduser())
     except DemonstrationError:
         return None
 
