@@ -192,7 +192,7 @@ def _inspect(values: flags.FlagValues) -> None:
     from jaxil.machine import memory
     from jaxil.machine.progress import shown
 
-    path = pathlib.Path(values.inspect).expanduser()
+    path = pathlib.Path(values.inspect)
     if values.inspect in states.shipped_tasks() and not path.exists():
         path = states.shipped_path(values.inspect)
     with _reported(path, f"--inspect={path}"), shown("inspecting") as progress:
@@ -205,7 +205,7 @@ def _inspect(values: flags.FlagValues) -> None:
         )
     name = path.resolve().stem
     # Never the input itself, which may be a video in this folder.
-    folder = pathlib.Path(values.output or ".").expanduser()
+    folder = pathlib.Path(values.output or ".")
     sheet, video = folder / f"{name}_sheet.png", folder / f"{name}_episode0.mp4"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -269,7 +269,7 @@ def _output_faults(values: flags.FlagValues) -> list[str]:
     """Checks the output before minutes of work are lost."""
     if values.output is None:
         return [] if values.inspect else ["--output=NAME.npz is missing"]
-    output = pathlib.Path(values.output).expanduser()
+    output = pathlib.Path(values.output)
     if values.inspect:
         is_free = output.is_dir() or not output.exists()
         return [] if is_free else [f"--output={output} must be a folder"]
