@@ -110,7 +110,12 @@ def load_policy(folder: str | os.PathLike) -> Policy:
     except CheckpointError as error:
         raise UsageError(str(error)) from error
     if config.encoder.subtract_mean_image and mean is None:  # of an earlier version
-        mean = agents.mean_image(config, assembly.load_demonstrations(config))
+        try:
+            mean = agents.mean_image(config, assembly.load_demonstrations(config))
+        except DemonstrationError as error:
+            raise UsageError(
+                f"the checkpoint has no mean image, and {error}"
+            ) from error
     head = params["actor"]["params"]["head"]
     (action_dim,) = head["output"]["bias"].shape
     networks = agents.make_networks(config, action_dim, 0.5 if mean is None else mean)
