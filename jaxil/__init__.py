@@ -1,7 +1,7 @@
 """Imitation learning from pixel observations, in JAX.
 
     policy = jaxil.load_policy("runs/quickstart")
-    environment = jaxil.make_environment("cartpole_swingup", seed=0, action_repeat=4)
+    environment = policy.make_environment()  # or jaxil.make_environment(task, seed=0)
     demonstrations = jaxil.load_demonstrations(task="cartpole_swingup")
 
 These are imported where they are first used, so that `import jaxil` takes no time, and

@@ -78,6 +78,10 @@ class Policy:
         actions = np.asarray(self._act(self.params.encoder, self.params.actor, batch))
         return actions[0] if is_single else actions
 
+    def make_environment(self, seed: int = 0) -> PixelEnvironment:
+        """Returns the task as the policy was trained on it."""
+        return assembly.environment_with_seed(self.config, seed)
+
     def description(self) -> str:
         """Returns a few words on the training."""
         config = self.config
