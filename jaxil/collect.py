@@ -7,7 +7,7 @@ evaluates the mean actions of the runs' policies and records the best. The file 
 simulator states, from which each training renders pixels for its agent; for tasks that
 are not dm_control's, it holds pixels.
 
-    python -m jaxil.collect --policy=package.module:function --task=gymnasium:ID \\
+    jaxil collect --policy=package.module:function --task=gymnasium:ID \\
         --output=FILE.npz
 
 records a function of the task's own observation, a flat vector, that returns an action
@@ -56,7 +56,7 @@ def main(argv: list[str]) -> None:
 
     print(startup.prepare(), file=sys.stderr, flush=True)
     functions = (_record, _record_policy, _inspect, _convert)
-    dict(zip(_JOBS, functions, strict=True))[jobs[0]](values)
+    functions[_JOBS.index(jobs[0])](values)
 
 
 def _record(values: flags.FlagValues) -> None:
@@ -186,15 +186,19 @@ def _write(
 
 
 def _inspect(values: flags.FlagValues) -> None:
-    from jaxil.demonstrations import inspection
+    from jaxil.demonstrations import inspection, states
     from jaxil.files.video import write_video
     from jaxil.files.writing import replacing
     from jaxil.machine import memory
+    from jaxil.machine.progress import shown
 
     path = pathlib.Path(values.inspect)
-    with _reported(path, f"--inspect={path}"):
+    if values.inspect in states.shipped_tasks() and not path.exists():
+        path = states.shipped_path(values.inspect)
+    with _reported(path, f"--inspect={path}"), shown("inspecting") as progress:
         seen = inspection.inspect(
             path,
+            progress=progress,
             image_size=values.image_size or _INSPECTED_SIZE,
             render_quality=values.render_quality,
             max_bytes=memory.spare_bytes(),
@@ -204,6 +208,7 @@ def _inspect(values: flags.FlagValues) -> None:
     folder = pathlib.Path(values.output or ".")
     sheet, video = folder / f"{name}_sheet.png", folder / f"{name}_episode0.mp4"
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         with replacing(sheet) as temporary:
             inspection.contact_sheet(seen).save(temporary, format="png")
         write_video(video, seen.video, fps=seen.frames_per_second, labels=(name, ""))
@@ -231,7 +236,10 @@ def _convert(values: flags.FlagValues) -> None:
                 path,
                 max_bytes=memory.spare_bytes(),
                 frame_skip=values.frame_skip,
-                image_size=values.image_size,
+                image_size=values.image_size or _CONVERTED_SIZE,
+                keep_aspect=values.image_size is None,
+                fit=values.fit,
+                camera=values.camera,
             )
         own.write_pixels(output, recording, origin=f"{recording.kind}, {path.name}")
     print(
@@ -263,8 +271,8 @@ def _output_faults(values: flags.FlagValues) -> list[str]:
         return [] if values.inspect else ["--output=NAME.npz is missing"]
     output = pathlib.Path(values.output)
     if values.inspect:
-        exists = output.is_dir()
-        return [] if exists else [f"--output={output} must be an existing folder"]
+        is_free = output.is_dir() or not output.exists()
+        return [] if is_free else [f"--output={output} must be a folder"]
     if output.is_dir():
         return [f"--output={output} is a folder: name a file, NAME.npz"]
     if values.convert and output.resolve() == pathlib.Path(values.convert).resolve():
@@ -303,11 +311,11 @@ def _define(values: flags.FlagValues) -> None:
     text("task", help="for --policy: the task, as in configs")
     number("action_repeat", 2, "for --policy: frames of one step", 1, 100)
     command.define_trust(values)
-    text("inspect", help="file or folder of any format to summarise")
+    text("inspect", help="file or folder of any format, or task, to show")
     text("convert", help="file or folder to convert to pixels; also --convert IN OUT")
     text("output", help="NAME.npz; for --inspect a folder for contact sheet and video")
     number("num_episodes", 50, "episodes to record", 1, 10_000)
-    image_size = "height and width of recorded or converted images; pixels keep theirs"
+    image_size = "of images; without it videos shrink to 84 or 160, pixels keep theirs"
     number("image_size", None, image_size, 8, 1024)
     flags.DEFINE_enum(
         "render_quality",
@@ -316,6 +324,14 @@ def _define(values: flags.FlagValues) -> None:
         "how --convert and --inspect render states",
         flag_values=values,
     )
+    flags.DEFINE_enum(
+        "fit",
+        "stretch",
+        ["stretch", "crop", "pad"],
+        "how --convert --image_size makes squares of frames that are not",
+        flag_values=values,
+    )
+    text("camera", default="", help="of a LeRobot dataset with several")
     number("frame_skip", 1, "--convert keeps every N-th frame of pixels", 1, 10_000)
 
 

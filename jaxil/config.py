@@ -49,6 +49,13 @@ FIELDS: dict[str, Field] = {
         "random colours, camera angle and background in each of the agent's episodes",
         choices=("none", "easy", "medium", "hard"),
     ),
+    "max_episode_frames": Field(
+        0,
+        "longest episode, cut off as by a time limit; 0: the task's own limit, or 1000 "
+        "if it has none",
+        0,
+        10**8,
+    ),
     "total_frames": Field(_EASY_FRAMES, "length of the run", 1, 10**10),
     # Replay and schedule.
     "replay_size_steps": Field(
@@ -110,10 +117,32 @@ FIELDS: dict[str, Field] = {
         choices=("auto", "native", "xla"),
     ),
     "demonstrations.source": Field("", "a file or folder; empty: the shipped file"),
-    "demonstrations.num_episodes": Field(10, "1, 10 or 50 in the paper", 1, 10**6),
+    "demonstrations.num_episodes": Field(
+        10,
+        "1, 10 or 50 in the paper; 10 takes fewer from a source of your own that "
+        "has fewer",
+        1,
+        10**6,
+    ),
     "demonstrations.frame_skip": Field(
         1, "keeps every n-th frame of a pixel file", 1, 10**4
     ),
+    "demonstrations.sampling": Field(
+        "frames",
+        "of pixel files; time: the frame nearest to each agent step, by the file's "
+        "frame rate or action repeat",
+        choices=("frames", "time"),
+    ),
+    "demonstrations.fit": Field(
+        "stretch",
+        "how frames that are not square become so: stretch, crop to the middle, or "
+        "pad with black",
+        choices=("stretch", "crop", "pad"),
+    ),
+    "demonstrations.action_repeat": Field(
+        0, "environment frames of a stored step, if a pixel file lacks it", 0, 1000
+    ),
+    "demonstrations.camera": Field("", "of a LeRobot dataset with several"),
     "demonstrations.distraction": Field(
         "none",
         "as `distraction`, for demonstrations of simulator states",
@@ -283,6 +312,16 @@ def _problems(
                 f"use {nearest}",
                 value,
             )
+    longest = config.max_episode_frames / config.action_repeat
+    if not {"max_episode_frames", "action_repeat", "replay_size_steps"} & bad and (
+        longest > config.replay_size_steps
+    ):
+        yield Fault(
+            "max_episode_frames",
+            "does not fit the replay, which must hold whole episodes",
+            f"use replay_size_steps={math.ceil(longest)} or more",
+            config.max_episode_frames,
+        )
     if config.exploration_std_end > config.exploration_std_start:
         yield Fault(
             "exploration_std_end",

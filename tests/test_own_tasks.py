@@ -116,14 +116,16 @@ def test_a_task_from_outside_is_recorded_trained_resumed_and_shown(
     assert episode.actions is not None
 
     flags = (
-        f"--config=configs/tiny.py:pdac,{task}",
+        f"--config=configs/tiny.py:zero,{task}",
         f"--workdir={workdir}",
-        *small("pdac"),
+        *small("zero"),
         *_SIZES,
         f"--config.demonstrations.source={expert}",
     )
     for total in (60, 120):
-        finished = run("launch", *flags, f"--config.total_frames={total}")
+        finished = run(
+            "launch", *flags, f"--config.total_frames={total}", timeout=600.0
+        )
         assert finished.returncode == 0, finished.stderr
     assert "resuming from the checkpoint" in finished.stderr
     frames = [int(row["frame"]) for row in rows(workdir / "train.csv")]

@@ -2,12 +2,21 @@
 
 import itertools
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxil.demonstrations.readers import lerobot, minari, own, pickles, replays, videos
+from jaxil.demonstrations.readers import (
+    hdf5,
+    lerobot,
+    minari,
+    own,
+    pickles,
+    pictures,
+    replays,
+    videos,
+)
 from jaxil.demonstrations.readers.frames import resized
 from jaxil.demonstrations.readers.recording import (
     FormatError,
@@ -20,14 +29,18 @@ from jaxil.demonstrations.readers.sandbox import read_in_child
 from jaxil.errors import printable
 from jaxil.files.untrusted import require_regular
 
-# The first that recognises a file reads it. Videos last: datasets may contain some.
-_READERS: tuple[Any, ...] = (own, pickles, minari, lerobot, replays, videos)
+# The first that recognises a file reads it. Datasets may contain videos, and folders
+# of videos pictures.
+_READERS: tuple[Any, ...] = (
+    *(own, pickles, minari, lerobot, replays, hdf5),
+    *(videos, pictures),
+)
 # Safe without a child process: parsed in Python, and checked before unpacking.
 _IN_PROCESS = (own, replays)
 FORMATS = (
     "jaxil states or pixels (.npz), ROT or PatchAIL pickles, folders of DrQ-v2 or "
-    "V-D4RL episodes (.npz), videos (mp4, mov, gif, webm, mkv, avi), Minari datasets, "
-    "LeRobot v3 datasets"
+    "V-D4RL episodes (.npz, .hdf5), videos (mp4, mov, gif, webm, mkv, avi), folders of "
+    "PNG or JPEG frames, NumPy images (.npy), Minari datasets, LeRobot v3 datasets"
 )
 
 
@@ -49,6 +62,10 @@ def open_recording(
     frame_skip: int = 1,
     image_size: int | None = None,
     keep_aspect: bool = False,
+    fit: str = "stretch",
+    camera: str = "",
+    action_repeat: int = 0,
+    frames_per_step: Callable[[Recording], float] | None = None,
 ) -> Recording:
     """Opens a file or folder; its content decides the format.
 
@@ -57,8 +74,13 @@ def open_recording(
       max_bytes: limit of each unpacked array.
       frame_skip: keeps every n-th frame, and sums the rewards in between.
       image_size: height and width of the frames; None keeps the file's.
-      keep_aspect: only shrinks videos, until their shorter side is `image_size`; other
-        formats keep their size.
+      keep_aspect: only shrinks videos and pictures, until their shorter side is
+        `image_size`; other formats keep their size.
+      fit: how frames become squares, see `frames.resized`.
+      camera: of a dataset with several.
+      action_repeat: of the stored steps, if the file does not say it; 0 if unknown.
+      frames_per_step: samples frames by time: how many of the file's make an agent
+        step. The nearest one is taken.
 
     Returns:
       The recording, whose episodes are checked as they are read.
@@ -73,20 +95,27 @@ def open_recording(
     reader = next((reader for reader in _READERS if reader.recognises(path)), None)
     if reader is None:
         raise FormatError(f"is cut off, damaged or in an unsupported format: {FORMATS}")
-    options = ReadOptions(max_bytes, frame_skip, image_size, keep_aspect)
+    options = ReadOptions(
+        max_bytes, frame_skip, image_size, keep_aspect, fit=fit, camera=camera
+    )
     if reader in _IN_PROCESS:
         items = checked(reader.read(path, options))
     else:
         items = read_in_child(reader.read, path, options)
     recording = next(items)
-    repeat, speed = recording.action_repeat, recording.frames_per_second
+    repeat = recording.action_repeat or action_repeat or None
+    recording = recording._replace(action_repeat=repeat)
+    speed = recording.frames_per_second
     if reader is videos:  # it has skipped frames already
         frame_skip = 1
+    stride: float = frame_skip
+    if frames_per_step is not None:
+        stride = frames_per_step(recording)
     return recording._replace(
-        episodes=_fitted(items, frame_skip, None if keep_aspect else image_size),
+        episodes=_fitted(items, stride, None if keep_aspect else image_size, fit),
         task=recording.task and printable(recording.task),
-        action_repeat=repeat and repeat * frame_skip,
-        frames_per_second=speed and speed / frame_skip,
+        action_repeat=repeat and round(repeat * stride),
+        frames_per_second=speed and speed / stride,
         notes=tuple(printable(note, 200) for note in recording.notes),
     )
 
@@ -96,23 +125,26 @@ def read_episodes(
     *,
     num_episodes: int,
     image_size: int,
-    frame_skip: int,
     max_bytes: int,
+    takes_fewer: bool = False,
+    **how: Any,
 ) -> PixelEpisodes:
     """Reads the first episodes, resized with antialiasing.
 
-    `max_bytes` limits the result and every intermediate array; for the other arguments
-    see `open_recording`.
+    `max_bytes` limits the result and every intermediate array; `takes_fewer` contents
+    itself with the episodes that there are; for the other arguments see
+    `open_recording`.
 
     Raises:
       FormatError: see `open_recording`; or too few episodes, or too many bytes.
     """
-    recording = open_recording(
-        path, max_bytes=max_bytes, frame_skip=frame_skip, image_size=image_size
-    )
+    recording = open_recording(path, max_bytes=max_bytes, image_size=image_size, **how)
+    if takes_fewer:
+        num_episodes = min(num_episodes, recording.num_episodes)
     if num_episodes > recording.num_episodes:
         raise FormatError(
-            f"holds {recording.num_episodes} episodes, but num_episodes={num_episodes}"
+            f"holds {recording.num_episodes} episodes, but num_episodes={num_episodes};"
+            f" set demonstrations.num_episodes={recording.num_episodes}"
         )
     episodes, num_bytes = [], 0
     for episode in itertools.islice(recording.episodes, num_episodes):
@@ -136,24 +168,31 @@ def read_episodes(
 
 
 def _fitted(
-    items: Iterator[PixelEpisode | None], frame_skip: int, image_size: int | None
+    items: Iterator[PixelEpisode | None],
+    stride: float,
+    image_size: int | None,
+    fit: str,
 ) -> Iterator[PixelEpisode]:
-    """Skips frames and resizes the others."""
+    """Takes a frame every `stride` of them and resizes it."""
     for index, episode in enumerate(item for item in items if item is not None):
         frames, actions, rewards, stored_size = episode
-        num_steps = (len(frames) - 1) // frame_skip
+        num_steps = int((len(frames) - 1) / stride + 1e-6)
         if num_steps < 1:
             what = f"has {len(frames)} frames in episode {index}"
-            raise FormatError(f"{what}, too few for frame_skip={frame_skip}")
-        used = num_steps * frame_skip
-        frames = frames[: used + 1 : frame_skip]
-        if actions is not None:
-            actions = actions[:used:frame_skip]
-        if rewards is not None and frame_skip > 1:
-            rewards = rewards[:used].reshape(num_steps, frame_skip).sum(axis=1)
+            skip = f"frame_skip={stride}" if isinstance(stride, int) else "one step"
+            raise FormatError(f"{what}, too few for {skip}")
+        if stride != 1:
+            times = np.rint(np.arange(num_steps + 1) * stride).astype(int)
+            frames = frames[times]
+            if actions is not None:
+                actions = actions[times[:-1]]
+            if rewards is not None:
+                sums = np.append(0.0, np.cumsum(rewards, dtype=np.float64))
+                rewards = np.diff(sums[times]).astype(np.float32)
         height, width = stored_size or frames.shape[1:3]
         if image_size is not None and frames.shape[1:3] != (image_size, image_size):
-            frames = np.stack([resized(x, (image_size, image_size)) for x in frames])
+            size = (image_size, image_size)
+            frames = np.stack([resized(x, size, fit) for x in frames])
         yield PixelEpisode(frames, actions, rewards, (height, width))
 
 

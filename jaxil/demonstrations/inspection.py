@@ -2,7 +2,7 @@
 
 import itertools
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,12 +40,19 @@ class Inspection(NamedTuple):
     frames_per_second: float  # of the video
 
 
-def inspect(path: pathlib.Path, *, max_bytes: int, **view: Any) -> Inspection:
+def inspect(
+    path: pathlib.Path,
+    *,
+    max_bytes: int,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    **view: Any,
+) -> Inspection:
     """Reads a demonstration file of any format; renders samples of simulator states.
 
     Args:
       path: file or folder.
       max_bytes: limit of each unpacked array.
+      progress: called with (done, all): images of states, or episodes of pixels.
       view: `image_size` and `render_quality` for states; videos are shrunk until their
         shorter side is `image_size`.
 
@@ -55,13 +62,15 @@ def inspect(path: pathlib.Path, *, max_bytes: int, **view: Any) -> Inspection:
       FormatError: another file is damaged or has an unknown format.
     """
     if states.recognises(path):
-        return _inspect_states(path, view)
+        return _inspect_states(path, progress, view)
     recording = foreign.open_recording(
         path, max_bytes=max_bytes, image_size=view["image_size"], keep_aspect=True
     )
     fps = recording.frames_per_second
     summaries, pictures, video = [], [], np.empty((0, 1, 1, 3), np.uint8)
+    height = width = 0
     for episode in recording.episodes:
+        progress(len(summaries), recording.num_episodes)
         frames, actions, rewards = episode.frames, episode.actions, episode.rewards
         height, width = episode.stored_size or frames.shape[1:3]
         if len(pictures) < _NUM_ROWS:
@@ -82,15 +91,29 @@ def inspect(path: pathlib.Path, *, max_bytes: int, **view: Any) -> Inspection:
         "action repeat": str(recording.action_repeat or "unknown"),
         "frames per second": "unknown" if fps is None else f"{fps:g}",
     }
+    if height != width:
+        facts["shape"] = (
+            "not square: demonstrations.fit=stretch (the default), crop or pad"
+        )
     for number, note in enumerate(recording.notes, start=1):
         facts[f"note {number}"] = note
     return Inspection(facts, summaries, pictures, video, fps or _DEFAULT_FPS)
 
 
-def _inspect_states(path: pathlib.Path, view: dict[str, Any]) -> Inspection:
+def _inspect_states(
+    path: pathlib.Path, progress: Callable[[int, int], None], view: dict[str, Any]
+) -> Inspection:
     stored = states.read_states(path)
     metadata = stored.metadata
     num_episodes, num_steps = stored.rewards.shape
+    num_rows = min(num_episodes, _NUM_ROWS)
+    total = num_rows * NUM_COLUMNS + num_steps + 1
+    pictures = []
+    for row in range(num_rows):
+        progress(row * NUM_COLUMNS, total)
+        pictures.append(_render(stored, row, spaced(num_steps + 1), view))
+    before = total - num_steps - 1
+    view = {**view, "progress": lambda done, _: progress(before + done, total)}
     versions = ", ".join(f"{k} {v}" for k, v in metadata["versions"].items())
     return Inspection(
         facts={
@@ -105,10 +128,7 @@ def _inspect_states(path: pathlib.Path, view: dict[str, Any]) -> Inspection:
             EpisodeSummary(num_steps + 1, "rendered", stored.actions.shape[2], value)
             for value in metadata["returns"]
         ],
-        pictures=[
-            _render(stored, episode, spaced(num_steps + 1), view)
-            for episode in range(min(num_episodes, _NUM_ROWS))
-        ],
+        pictures=pictures,
         video=_render(stored, 0, slice(None), view),
         frames_per_second=_fps(stored),
     )

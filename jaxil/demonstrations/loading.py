@@ -1,7 +1,6 @@
 """Loads demonstrations of any format as the agent observes them, and samples them."""
 
 import functools
-import hashlib
 import os
 import pathlib
 from collections.abc import Callable
@@ -10,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxil.demonstrations import foreign, mismatch, rendering, states
-from jaxil.demonstrations.readers.recording import FormatError
+from jaxil.demonstrations.readers.recording import FormatError, Recording
 from jaxil.demonstrations.states import StateDemonstrations, fault, unreadable
 from jaxil.environments import tasks
 from jaxil.environments.interaction import Restorable
@@ -48,6 +47,28 @@ class Demonstrations(NamedTuple):
         return float(np.mean(returns)) if returns else None
 
 
+class Reading(NamedTuple):
+    """How a file is read.
+
+    Attributes:
+      frame_skip: keeps every n-th frame of a file of pixels.
+      sampling: of a file of pixels; "time" takes the frame nearest to each agent step.
+      fit: one of `frames.FITS`: how frames of other shapes become squares.
+      dataset_camera: of a dataset with several.
+      stated_action_repeat: of a file of pixels that does not say it; 0 if unknown.
+      takes_fewer: whether fewer episodes than asked for will do.
+      max_bytes: memory limit for a file of pixels.
+    """
+
+    frame_skip: int = 1
+    sampling: str = "frames"
+    fit: str = "stretch"
+    dataset_camera: str = ""
+    stated_action_repeat: int = 0
+    takes_fewer: bool = False
+    max_bytes: int = archive.MAX_BYTES
+
+
 def check(
     source: str | os.PathLike,
     *,
@@ -56,21 +77,20 @@ def check(
     action_repeat: int,
     image_size: int = 84,
     observation: str = "pixels",
-    frame_skip: int = 1,
-    max_bytes: int = archive.MAX_BYTES,
     sees_actions: bool = False,
+    **how: Any,
 ) -> None:
     """Raises what `load` would raise, without rendering anything.
 
     `sees_actions` tells whether the method needs the expert's actions; for the other
     arguments see `load`.
     """
-    path = _path_of(source, task)
+    path, read = _path_of(source, task), Reading(**how)
     if states.recognises(path):
-        _open_states(path, task, num_episodes, action_repeat, frame_skip)
+        _open_states(path, task, num_episodes, action_repeat, read)
         return
     loaded = _load_pixels(
-        path, task, num_episodes, image_size, observation, frame_skip, max_bytes
+        path, task, num_episodes, action_repeat, image_size, observation, read
     )
     if not sees_actions:
         return
@@ -94,10 +114,9 @@ def load(
     observation: str = "pixels",
     camera: str = "",
     distraction: str = "none",
-    frame_skip: int = 1,
-    max_bytes: int = archive.MAX_BYTES,
     cache: bool = True,
     progress: Callable[[int, int], None] | None = None,
+    **how: Any,
 ) -> Demonstrations:
     """Loads demonstrations; states are rendered by the agent's own environment.
 
@@ -109,28 +128,31 @@ def load(
       num_episodes: loads the file's first ones.
       action_repeat: the agent's; a multiple of the one in a file of states. Rewards of
         merged steps are summed, and the first action is kept.
-      frame_skip: keeps every n-th frame of a file of pixels.
-      max_bytes: memory limit for a file of pixels.
       cache: whether to cache rendered images.
       progress: called with (images done, all images) while rendering.
+      how: see `Reading`.
 
     Raises:
       DemonstrationError: the file cannot be read, is damaged, or does not fit.
     """
-    path = _path_of(source, task)
+    path, read = _path_of(source, task), Reading(**how)
     if not states.recognises(path):
         loaded = _load_pixels(
-            path, task, num_episodes, image_size, observation, frame_skip, max_bytes
+            path, task, num_episodes, action_repeat, image_size, observation, read
         )
         mismatch.warn_of_pixels(
             path,
             loaded.metadata,
+            loaded.num_frames,
             image_size=image_size,
             task=task,
             action_repeat=action_repeat,
+            fit=read.fit,
         )
+        mismatch.warn_of_expert(path, num_episodes, *loaded[:4])
         return loaded
-    stored, stride = _open_states(path, task, num_episodes, action_repeat, frame_skip)
+    stored, stride = _open_states(path, task, num_episodes, action_repeat, read)
+    wanted, num_episodes = num_episodes, len(stored.rewards)
     metadata = stored.metadata
     mismatch.warn_of_versions(path, metadata["versions"])
     num_steps = stored.rewards.shape[1] // stride
@@ -152,14 +174,12 @@ def load(
     except ValueError as error:
         raise fault(path, f"cannot be rendered ({error})") from error
     rewards = stored.rewards[:, :used].reshape(num_episodes, num_steps, stride).sum(2)
+    num_frames = np.full(num_episodes, num_steps + 1)
+    actions = stored.actions[:, :used:stride]
+    mismatch.warn_of_expert(path, wanted, frames, num_frames, actions, rewards)
     served = {"file": str(path), "action_repeat": action_repeat}
-    return Demonstrations(
-        frames,
-        np.full(num_episodes, num_steps + 1),
-        stored.actions[:, :used:stride],
-        rewards,
-        {**metadata, **served, "returns": _returns(rewards)},
-    )
+    metadata = {**metadata, **served, "returns": _returns(rewards)}
+    return Demonstrations(frames, num_frames, actions, rewards, metadata)
 
 
 def sample(
@@ -234,27 +254,6 @@ def sample_indices(
     return ExpertBatch(stacks(steps), actions, successor)
 
 
-def digest(source: str | os.PathLike, task: str) -> str:
-    """Returns a digest of a source's content, which does not depend on its path.
-
-    Raises:
-      DemonstrationError: it cannot be read.
-    """
-    path = _path_of(source, task)
-    total = hashlib.blake2b(digest_size=16)
-    try:
-        parts = sorted(path.rglob("*")) if path.is_dir() else [path]
-        for part in parts:
-            if part.is_file():
-                with part.open("rb") as file:
-                    one = hashlib.file_digest(file, "blake2b")
-                name = "" if part == path else part.relative_to(path).as_posix()
-                total.update(f"{name} {one.hexdigest()}\n".encode())
-    except OSError as error:
-        raise unreadable(path, error) from error
-    return total.hexdigest()
-
-
 def _path_of(source: str | os.PathLike, task: str) -> pathlib.Path:
     if not str(source):
         return states.shipped_path(task)
@@ -272,16 +271,18 @@ def _open_states(
     task: str,
     num_episodes: int,
     action_repeat: int,
-    frame_skip: int,
+    read: Reading,
 ) -> tuple[StateDemonstrations, int]:
     """Returns a file's content, and the stored steps per agent step."""
-    stored = states.read_states(path, task=task, num_episodes=num_episodes)
+    stored = states.read_states(
+        path, task=task, num_episodes=num_episodes, takes_fewer=read.takes_fewer
+    )
     recorded = stored.metadata["action_repeat"]
     if action_repeat < 1 or action_repeat % recorded:
         what = f"was recorded with action_repeat={recorded}, not {action_repeat}"
         raise fault(path, what, f"Use a multiple of {recorded}, or record it again")
-    if frame_skip != 1:
-        what = f"holds states, but frame_skip={frame_skip} is for pixels"
+    if read.frame_skip != 1:
+        what = f"holds states, but frame_skip={read.frame_skip} is for pixels"
         raise fault(path, what, "Set demonstrations.frame_skip to 1")
     stride = action_repeat // recorded
     if stride > stored.rewards.shape[1]:
@@ -315,25 +316,47 @@ def _read_pixels(
     stamps: tuple[tuple[str, int], ...],
     task: str,
     num_episodes: int,
+    action_repeat: int,
     image_size: int,
     observation: str,
-    frame_skip: int,
-    max_bytes: int,
+    how: Reading,
 ) -> Demonstrations:
     del stamps  # part of the key only
     if observation != "pixels":
         what = f"holds pixels or is damaged, but observation={observation!r}"
         raise fault(path, what, "Set observation to 'pixels', or use a file of states")
-    if num_episodes < 1 or frame_skip < 1:
-        what = f"does not fit num_episodes={num_episodes} and frame_skip={frame_skip}"
+    skip = how.frame_skip
+    if num_episodes < 1 or skip < 1:
+        what = f"does not fit num_episodes={num_episodes} and frame_skip={skip}"
         raise fault(path, what, "Both must be at least 1")
+    by_time = how.sampling == "time"
+    if by_time and skip > 1:
+        what = f"is sampled by time, but demonstrations.frame_skip={skip}"
+        raise fault(path, what, "Set one of the two")
+
+    def frames_per_step(recording: Recording) -> float:
+        if recording.action_repeat:
+            return action_repeat / recording.action_repeat
+        seconds, _ = tasks.timing(task, action_repeat)
+        if not recording.frames_per_second or not seconds:
+            raise FormatError(
+                "tells no frame rate, so it cannot be sampled by time; state "
+                "demonstrations.action_repeat"
+            )
+        return recording.frames_per_second * seconds
+
     try:
         read = foreign.read_episodes(
             path,
             num_episodes=num_episodes,
             image_size=image_size,
-            frame_skip=frame_skip,
-            max_bytes=max_bytes,
+            max_bytes=how.max_bytes,
+            takes_fewer=how.takes_fewer,
+            frame_skip=skip,
+            fit=how.fit,
+            camera=how.dataset_camera,
+            action_repeat=how.stated_action_repeat,
+            frames_per_step=frames_per_step if by_time else None,
         )
     except OSError as error:
         raise unreadable(path, error) from error

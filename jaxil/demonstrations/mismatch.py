@@ -4,10 +4,19 @@ import logging
 import pathlib
 from typing import Any
 
+import numpy as np
+
 from jaxil.environments import suite, tasks
 from jaxil.errors import printable
 
 _RATE_TOLERANCE = 0.1  # relative, of a video's frame rate
+_LARGEST_ACTION = 1.001  # beyond rounding
+_MAX_SHOWN = 10
+_FITS = {
+    "stretch": "squeezed into a square",
+    "crop": "cut to the square in their middle",
+    "pad": "with black bars",
+}
 
 _logger = logging.getLogger(__name__)
 
@@ -15,25 +24,29 @@ _logger = logging.getLogger(__name__)
 def warn_of_pixels(
     path: pathlib.Path,
     metadata: dict[str, Any],
+    num_frames: np.ndarray,
     *,
     image_size: int,
     task: str,
     action_repeat: int,
+    fit: str,
 ) -> None:
     """Warns where a file of pixels differs from the agent's settings.
 
-    `metadata` is that of the loaded `Demonstrations`.
+    `metadata` and `num_frames` are those of the loaded `Demonstrations`.
     """
     size, (height, width) = image_size, metadata["stored_size"]
-    messages = [
-        f"{path} ({metadata['kind']}) holds pixels of another renderer: light, colours "
-        "and camera may differ from the agent's."
-    ]
+    messages = []
+    if metadata["task"] != task or tasks.is_of_suite(task):
+        messages.append(
+            f"{path} ({metadata['kind']}) holds pixels of another renderer: light, "
+            "colours and camera may differ from the agent's."
+        )
     if (height, width) != (size, size):
-        squeezed = "" if height == width else ", squeezed into a square"
+        how = "" if height == width else f", {_FITS[fit]} (demonstrations.fit={fit})"
         messages.append(
             f"{path}: frames of {width}x{height} pixels are resized to {size}x{size}"
-            f"{squeezed}."
+            f"{how}."
         )
     repeat = metadata["action_repeat"]
     if repeat is not None and repeat != action_repeat:
@@ -42,17 +55,60 @@ def warn_of_pixels(
             f"{action_repeat}: adjust action_repeat or demonstrations.frame_skip."
         )
     speed = metadata["frames_per_second"]
-    seconds = tasks.decision_seconds(task, action_repeat)
+    seconds, episode_steps = tasks.timing(task, action_repeat)
     wanted = 1.0 / seconds if seconds else speed
     if speed and wanted and abs(speed / wanted - 1.0) > _RATE_TOLERANCE:
         messages.append(
             f"{path} has {speed:.3g} frames per second, but the agent makes "
             f"{wanted:.3g} steps: about {speed / wanted:.3g} frames per step. "
-            "Adjust demonstrations.frame_skip or action_repeat."
+            "Set demonstrations.sampling=time, or adjust demonstrations.frame_skip or "
+            "action_repeat."
+        )
+    longest = int(num_frames.max()) - 1
+    if not repeat and not speed and episode_steps and longest != episode_steps:
+        messages.append(
+            f"{path} does not say its action repeat, and its longest episode has "
+            f"{longest} steps, but the task's {episode_steps} at "
+            f"action_repeat={action_repeat}. State demonstrations.action_repeat."
         )
     messages += [f"{path}: {note}" for note in metadata["notes"]]
     for message in messages:
         _logger.warning("%s", printable(message))
+
+
+def warn_of_expert(
+    path: pathlib.Path,
+    num_wanted: int,
+    frames: np.ndarray,
+    num_frames: np.ndarray,
+    actions: np.ndarray | None,
+    rewards: np.ndarray | None,
+) -> None:
+    """Warns of episodes from which nothing, or the wrong thing, can be learned.
+
+    The arrays are those of the loaded `Demonstrations`, of which `num_wanted` were
+    asked for.
+    """
+    messages = []
+    if len(frames) < num_wanted:
+        messages.append(f"holds {len(frames)} of {num_wanted} episodes: all are used.")
+    if actions is not None and np.abs(actions).max(initial=0.0) > _LARGEST_ACTION:
+        messages.append(
+            f"has actions from {actions.min():.3g} to {actions.max():.3g}, but the "
+            "agent's lie in [-1, 1]: rescale them before actions are imitated."
+        )
+    still = [
+        index
+        for index, (episode, length) in enumerate(zip(frames, num_frames))
+        if all(np.array_equal(episode[0], frame) for frame in episode[1:length])
+    ]
+    if still:
+        shown = ", ".join(map(str, still[:_MAX_SHOWN]))
+        messages.append(f"has episodes in which nothing ever changes: {shown}.")
+    if rewards is not None and not rewards.any():
+        messages.append("shows an expert whose task return is 0.")
+    for message in messages:
+        _logger.warning("%s %s", path, message)
 
 
 def warn_of_versions(path: pathlib.Path, recorded: dict[str, str]) -> None:

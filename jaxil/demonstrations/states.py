@@ -10,6 +10,7 @@ Pixels would take a thousand times the space and would not match another machine
 renderer.
 """
 
+import hashlib
 import importlib.metadata
 import json
 import os
@@ -125,6 +126,26 @@ def shipped_path(task: str) -> pathlib.Path:
     return path
 
 
+def digest(path: pathlib.Path) -> str:
+    """Returns a digest of the content of a file or folder, whatever its name.
+
+    Raises:
+      DemonstrationError: it cannot be read.
+    """
+    total = hashlib.blake2b(digest_size=16)
+    try:
+        parts = sorted(path.rglob("*")) if path.is_dir() else [path]
+        for part in parts:
+            if part.is_file():
+                with part.open("rb") as file:
+                    one = hashlib.file_digest(file, "blake2b")
+                name = "" if part == path else part.relative_to(path).as_posix()
+                total.update(f"{name} {one.hexdigest()}\n".encode())
+    except OSError as error:
+        raise unreadable(path, error) from error
+    return total.hexdigest()
+
+
 def write_states(path: str | os.PathLike, demonstrations: StateDemonstrations) -> None:
     """Writes a file atomically; DemonstrationError if the content is invalid."""
     path = pathlib.Path(path)
@@ -143,7 +164,11 @@ def recognises(path: pathlib.Path) -> bool:
 
 
 def read_states(
-    path: str | os.PathLike, *, task: str | None = None, num_episodes: int | None = None
+    path: str | os.PathLike,
+    *,
+    task: str | None = None,
+    num_episodes: int | None = None,
+    takes_fewer: bool = False,
 ) -> StateDemonstrations:
     """Reads and checks a whole file, without rendering.
 
@@ -151,6 +176,7 @@ def read_states(
       path: the file.
       task: the required task; None for any.
       num_episodes: returns the first ones; None for all.
+      takes_fewer: whether all will do, if there are fewer.
 
     Raises:
       DemonstrationError: the file cannot be read, is damaged, or does not fit.
@@ -172,11 +198,11 @@ def read_states(
     if task is not None and metadata["task"] != task:
         raise other_task(path, metadata["task"], task)
     stored = len(demonstrations.rewards)
-    if num_episodes is None:
+    if num_episodes is None or (takes_fewer and num_episodes >= stored):
         return demonstrations
     if not 1 <= num_episodes <= stored:
         what = f"holds {stored} episodes, but num_episodes={num_episodes}"
-        raise fault(path, what, f"Use 1 to {stored}")
+        raise fault(path, what, f"Use 1 to {stored} as demonstrations.num_episodes")
     kept = [array[:num_episodes] for array in demonstrations[:-1]]
     metadata = {**metadata, "returns": metadata["returns"][:num_episodes]}
     return StateDemonstrations(*kept, metadata=metadata)

@@ -99,13 +99,13 @@ def make_environment(
 
 
 @functools.cache
-def decision_seconds(task: str, action_repeat: int) -> float | None:
-    """Returns the simulated duration of an agent step; None if unknown."""
+def timing(task: str, action_repeat: int) -> tuple[float | None, int | None]:
+    """Returns an agent step's seconds, and an episode's steps; None if unknown."""
     settings = {"action_repeat": action_repeat, "image_size": 8}
     environment = make_environment(task, seed=0, **settings)
-    seconds = environment.decision_seconds
+    found = environment.decision_seconds, environment.episode_steps
     environment.close()
-    return seconds
+    return found
 
 
 class _Gymnasium(dm_env.Environment):

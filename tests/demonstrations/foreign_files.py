@@ -265,6 +265,35 @@ def write_replays(path: pathlib.Path, seed: int) -> None:
         save(path / name, allow_pickle=False, **entries)
 
 
+def write_hdf5(path: pathlib.Path, seed: int) -> None:
+    """Two episodes of V-D4RL, end to end."""
+    import h5py
+
+    rng = np.random.default_rng(seed)
+    episodes = [drqv2_entries(*play(rng, num_steps)) for num_steps in (3, 6)]
+    for entries in episodes:
+        entries["reward"] = entries["reward"][:, 0]
+        types = np.ones(len(entries["action"]), np.int64)
+        types[0], types[-1] = 0, 2
+        entries["step_type"] = types
+    with h5py.File(path, "w") as file:
+        for name in episodes[0]:
+            file[name] = np.concatenate([entries[name] for entries in episodes])
+
+
+def write_pictures(path: pathlib.Path, seed: int) -> None:
+    """A folder of two episodes as PNG files, or a NumPy array of one."""
+    rng = np.random.default_rng(seed)
+    if seed % 2:
+        with path.open("wb") as file:
+            np.save(file, _random_frames(rng, 5))
+        return
+    for episode, length in enumerate((4, 3)):
+        (path / f"episode{episode}").mkdir(parents=True)
+        for index, frame in enumerate(_random_frames(rng, length)):
+            Image.fromarray(frame).save(path / f"episode{episode}" / f"{index}.png")
+
+
 PICKLE_FORMS = ("arrays", "object arrays", "lists of arrays", "lists of steps")
 
 

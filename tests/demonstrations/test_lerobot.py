@@ -309,6 +309,18 @@ def test_information_that_does_not_fit_is_refused(path, name):
     assert "\n" not in str(caught.value)
 
 
+def test_one_of_several_cameras_is_read_by_name(path):
+    (before, *_) = read(path)[1]
+    info = json.loads((path / "meta" / "info.json").read_text())
+    set_info(path, features={**info["features"], "other": feature("video")})
+    with pytest.raises(FormatError, match=r"demonstrations\.camera=NAME"):
+        read(path)
+    with pytest.raises(FormatError, match=r"has no camera 'third', but: .*other"):
+        read(path, camera="third")
+    (after, *_) = read(path, camera=CAMERA)[1]
+    np.testing.assert_array_equal(after.frames, before.frames)
+
+
 def test_a_camera_whose_name_leads_outside_is_refused(path):
     camera = "../../.."
     set_info(path, features={camera: feature("video")})

@@ -42,6 +42,8 @@ FORMATS = {
     "own": Format("write_own", 2, 60),
     "pickles": Format("write_pickle", 16, 16),
     "replays": Format("write_replays", 4, 60),
+    "pictures": Format("write_pictures", 2, 20),
+    "hdf5": Format("write_hdf5", 2, 8, "h5py"),
     "videos": Format("write_video", 2, 8),
     "minari": Format("write_minari", 2, 8, "minari"),
     "lerobot": Format("write_lerobot", 2, 6, "pyarrow"),

@@ -4,21 +4,67 @@ import io
 from collections.abc import Sequence
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps
 
 from jaxil.demonstrations.readers.recording import FormatError, ReadOptions
 
+FITS = ("stretch", "crop", "pad")
 _MAX_CHANNELS = 30  # of ten frames; a longer axis is the height or width
 
 
-def resized(frame: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Returns a frame [H, W, 3] scaled to (height, width), with antialiasing."""
+def resized(
+    frame: np.ndarray, size: tuple[int, int], fit: str = "stretch"
+) -> np.ndarray:
+    """Returns a frame [H, W, 3] scaled to (height, width), with antialiasing.
+
+    Where the shapes differ, `fit` is "stretch", "crop" to the middle, or "pad" with
+    black.
+    """
     if frame.shape[:2] == size:
         return frame
     # Pillow's bilinear filter grows with the scale, which prevents aliasing.
-    height, width = size
-    image = Image.fromarray(frame)
-    return np.asarray(image.resize((width, height), Image.Resampling.BILINEAR))
+    wanted, image = size[::-1], Image.fromarray(frame)
+    bilinear = Image.Resampling.BILINEAR
+    if fit == "crop":
+        return np.asarray(ImageOps.fit(image, wanted, bilinear))
+    if fit == "pad":
+        return np.asarray(ImageOps.pad(image, wanted, bilinear, color=(0, 0, 0)))
+    return np.asarray(image.resize(wanted, bilinear))
+
+
+def wanted_size(stored: tuple[int, int], options: ReadOptions) -> tuple[int, int]:
+    """Returns the (height, width) that frames of a stored size are scaled to."""
+    if options.image_size is None:
+        return stored
+    if not options.keep_aspect:
+        return options.image_size, options.image_size
+    scale = min(1.0, options.image_size / min(stored))
+    return max(1, round(stored[0] * scale)), max(1, round(stored[1] * scale))
+
+
+def as_rgb(images: np.ndarray) -> np.ndarray:
+    """Returns images of other kinds as uint8 [..., H, W, 3].
+
+    Args:
+      images: gray [..., H, W] or [..., H, W, 1], RGB, or RGBA, whose alpha is dropped;
+        uint8, bool, uint16 of the full range, or floats in [0, 1].
+
+    Raises:
+      FormatError: another type or shape, or floats outside [0, 1].
+    """
+    if images.ndim < 3 or images.shape[-1] not in (1, 3, 4):
+        images = images[..., None]
+    if images.dtype == np.uint16:
+        images = (images >> 8).astype(np.uint8)
+    elif images.dtype == bool:
+        images = images.astype(np.uint8) * np.uint8(255)
+    elif images.dtype.kind == "f":
+        if not (np.min(images) >= 0.0 and np.max(images) <= 1.0):
+            raise FormatError("has images of real numbers outside [0, 1]")
+        images = np.rint(images * 255.0).astype(np.uint8)
+    if images.dtype != np.uint8:
+        raise FormatError(f"has images of type {images.dtype}")
+    return images[..., [0, 0, 0]] if images.shape[-1] == 1 else images[..., :3]
 
 
 def newest_frames(observations: np.ndarray) -> np.ndarray:
@@ -51,8 +97,15 @@ def newest_frames(observations: np.ndarray) -> np.ndarray:
     return np.array(observations[..., -3:], order="C")
 
 
+def rgb_picture(image: Image.Image) -> np.ndarray:
+    """Returns an opened picture of any mode as uint8 [H, W, 3]."""
+    if image.mode.startswith(("I", "F")):  # 16 bits; Pillow's own conversion clips
+        return as_rgb(np.asarray(image).astype(np.uint16))
+    return np.asarray(image.convert("RGB"))
+
+
 def decode_pictures(files: Sequence[bytes], options: ReadOptions) -> np.ndarray:
-    """Decodes RGB images of one size from JPEG or PNG files: uint8 [T, H, W, 3]."""
+    """Decodes images of one size from JPEG or PNG files: uint8 [T, H, W, 3]."""
     pictures = []
     for index, content in enumerate(files):
         try:
@@ -60,9 +113,7 @@ def decode_pictures(files: Sequence[bytes], options: ReadOptions) -> np.ndarray:
                 # Before anything is decoded.
                 name = f"{len(files)} images of {image.width}x{image.height} pixels"
                 options.check_bytes(name, len(files) * image.width * image.height * 3)
-                if image.mode != "RGB":
-                    raise FormatError(f"has images of mode {image.mode}, not RGB")
-                pictures.append(np.asarray(image))
+                pictures.append(rgb_picture(image))
         except FormatError:
             raise
         except Exception as error:  # Pillow's parsers raise many kinds

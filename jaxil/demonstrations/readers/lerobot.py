@@ -40,7 +40,7 @@ class _Dataset(NamedTuple):
     root: pathlib.Path
     fps: float
     num_episodes: int
-    camera: str  # name of the only camera
+    camera: str  # name of the one that is read
     is_video: bool  # whether its images are in videos, not in the Parquet files
     columns: dict[str, str]  # of "actions" and "rewards", if present
     paths: dict[str, Any]  # path templates of "data" and "video"
@@ -62,8 +62,8 @@ def recognises(path: pathlib.Path) -> bool:
 
 
 def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
-    """Reads a dataset of exactly one camera; opens no file outside its folder."""
-    dataset = _read_info(path)
+    """Reads one camera of a dataset; opens no file outside its folder."""
+    dataset = _read_info(path, options.camera)
     try:
         import pyarrow  # noqa: F401
     except ImportError:
@@ -93,7 +93,7 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
         yield shown._replace(**values)
 
 
-def _read_info(root: pathlib.Path) -> _Dataset:
+def _read_info(root: pathlib.Path, camera: str) -> _Dataset:
     """Reads and checks meta/info.json."""
     info = read_json(_inside(root, _INFO))
     version, features = info.get("codebase_version"), info.get("features")
@@ -113,8 +113,14 @@ def _read_info(root: pathlib.Path) -> _Dataset:
         for name, feature in features.items()
     }
     cameras = [name for name, kind in kinds.items() if kind in ("video", "image")]
+    if camera in cameras:
+        cameras = [camera]
+    elif camera:
+        raise FormatError(f"has no camera {camera!r}, but: {', '.join(cameras)}")
     if len(cameras) != 1:
-        raise FormatError(f"has {len(cameras)} cameras, not one: {', '.join(cameras)}")
+        way_out = "; choose one with demonstrations.camera=NAME" if cameras else ""
+        names = ", ".join(cameras)
+        raise FormatError(f"has {len(cameras)} cameras, not one: {names}{way_out}")
     is_video = kinds[cameras[0]] == "video"
     paths = {name: info.get(f"{name}_path") for name in ("data", "video")}
     for name in paths if is_video else ("data",):

@@ -68,21 +68,21 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
             raise FormatError(
                 f"holds {len(numbers)} episodes, but {_METADATA} says {promised!r:.50}"
             )
-        first = _member(file, "episode_0")
+        first = member(file, "episode_0")
         image = _image_in(first)
         notes = ()
-        if _is_jpeg(_member(first, image)):
+        if _is_jpeg(member(first, image)):
             notes += ("Its images are JPEGs, which have artefacts.",)
         if _actions(first, options) is None:
             notes += ("Its actions are ignored: they are not vectors of real numbers.",)
         task = _task_of(metadata)
         yield Recording("Minari dataset", len(numbers), task=task, notes=notes)
         for number in numbers:
-            episode = _member(file, f"episode_{number}")
+            episode = member(file, f"episode_{number}")
             yield PixelEpisode(
-                _frames(_member(episode, image), options),
+                _frames(member(episode, image), options),
                 _actions(episode, options),
-                _values(_member(episode, "rewards"), options),
+                values(member(episode, "rewards"), options),
             )
 
 
@@ -101,7 +101,7 @@ def _task_of(metadata: dict[str, Any]) -> str | None:
     return None if found is None else f"{found[1]}_{found[2]}"
 
 
-def _member(group: Any, path: str) -> Any:
+def member(group: Any, path: str) -> Any:
     """Returns a group or dataset of this file; follows no links."""
     import h5py
 
@@ -118,7 +118,7 @@ def _image_in(episode: Any) -> str:
     """Returns the path of the one image in an observation."""
     import h5py
 
-    observations = _member(episode, "observations")
+    observations = member(episode, "observations")
     found = [("observations", observations)]
     if isinstance(observations, h5py.Group):  # a dictionary; `visititems` skips links
         observations.visititems(
@@ -153,24 +153,27 @@ def _frames(dataset: Any, options: ReadOptions) -> np.ndarray:
         _check(dataset, options)
         files = [np.asarray(row, np.uint8).tobytes() for row in dataset]
         return decode_pictures(files, options)
-    return _values(dataset, options)
+    return values(dataset, options)
 
 
 def _actions(episode: Any, options: ReadOptions) -> np.ndarray | None:
     """Returns actions [T, A]; None for any other kind."""
-    dataset = _member(episode, "actions")
+    dataset = member(episode, "actions")
     if getattr(dataset, "dtype", np.dtype("O")).kind != "f" or dataset.ndim > 2:
         return None
-    values = _values(dataset, options)
-    return values[:, None] if values.ndim == 1 else values
+    actions = values(dataset, options)
+    return actions[:, None] if actions.ndim == 1 else actions
 
 
-def _values(dataset: Any, options: ReadOptions) -> np.ndarray:
-    _check(dataset, options)
-    return dataset[()]
+def values(
+    dataset: Any, options: ReadOptions, rows: slice | tuple[()] = ()
+) -> np.ndarray:
+    """Returns the values of some rows, after `_check`."""
+    _check(dataset, options, rows)
+    return dataset[rows]
 
 
-def _check(dataset: Any, options: ReadOptions) -> None:
+def _check(dataset: Any, options: ReadOptions, rows: slice | tuple[()] = ()) -> None:
     """Raises FormatError if the values are in another file, or too many."""
     if not hasattr(dataset, "dtype"):
         raise FormatError(f"has no numbers in {dataset.name}")
@@ -181,7 +184,11 @@ def _check(dataset: Any, options: ReadOptions) -> None:
     if not filters <= _FILTERS:
         raise FormatError(f"has {name} with unsupported filters {sorted(filters)}")
     num_bytes = dataset.size * dataset.dtype.itemsize
-    options.check_bytes(f"{name} of shape {dataset.shape}", num_bytes)
+    used_bytes = num_bytes
+    if isinstance(rows, slice):
+        length = len(range(*rows.indices(len(dataset))))
+        used_bytes = num_bytes * length // max(len(dataset), 1)
+    options.check_bytes(f"{name} of shape {dataset.shape}", used_bytes)
     stored = dataset.id.get_storage_size()
     if num_bytes > stored * (_MAX_RATIO if filters else 1):
         raise FormatError(f"is damaged: {name} stores {stored} of {num_bytes} bytes")

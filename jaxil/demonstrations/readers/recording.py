@@ -31,12 +31,14 @@ class FormatError(ValueError):
 
 
 class ReadOptions(NamedTuple):
-    """Options of the caller. Only videos use the last three, to save memory."""
+    """Options of the caller. Videos and pictures scale at once, to save memory."""
 
     max_bytes: int  # limit of an episode's frames and of any other array
-    frame_skip: int = 1  # keeps every n-th frame
+    frame_skip: int = 1  # keeps every n-th frame; videos skip the others at once
     image_size: int | None = None  # height and width; None keeps the file's
     keep_aspect: bool = False  # only shrinks, until the shorter side is `image_size`
+    fit: str = "stretch"  # one of `frames.FITS`: how other shapes become squares
+    camera: str = ""  # of a dataset with several
 
     def check_bytes(self, name: str, num_bytes: int) -> None:
         """Raises FormatError for more than `max_bytes`."""

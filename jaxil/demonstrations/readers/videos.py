@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from jaxil.demonstrations.readers.frames import resized
+from jaxil.demonstrations.readers.frames import resized, wanted_size
 from jaxil.demonstrations.readers.recording import (
     FormatError,
     Item,
@@ -148,19 +148,25 @@ def _frames_of_gif(path: pathlib.Path) -> int:
 
 
 def decode(path: pathlib.Path, options: ReadOptions) -> Iterator[_Frame]:
-    """Yields all frames [H, W, 3], rotated and scaled, with their original size."""
+    """Yields all frames [H, W, 3], rotated and scaled, with their original size.
+
+    Frames that `options` skips come empty.
+    """
     from av.video.reformatter import VideoReformatter
 
     size = None
     reformatter = VideoReformatter()
     with _opened(path) as (container, stream):
-        for frame in container.decode(stream):
+        for index, frame in enumerate(container.decode(stream)):
+            if index % options.frame_skip:
+                yield np.empty((0, 0, 3), np.uint8), (0, 0)
+                continue
             rgb = reformatter.reformat(frame, format="rgb24", threads=1)
             picture = _upright(rgb.to_ndarray(), frame)
             stored = picture.shape[:2]
             if size is None:
-                size = _wanted_size(stored, options)
-            yield resized(picture, size), stored
+                size = wanted_size(stored, options)
+            yield resized(picture, size, options.fit), stored
 
 
 @contextlib.contextmanager
@@ -205,15 +211,6 @@ def _upright(picture: np.ndarray, frame: Any) -> np.ndarray:
     if abs(b) > abs(a):
         picture, a, d = picture.swapaxes(0, 1), c, b
     return np.ascontiguousarray(picture[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
-
-
-def _wanted_size(stored: tuple[int, int], options: ReadOptions) -> tuple[int, int]:
-    if options.image_size is None:
-        return stored
-    if not options.keep_aspect:
-        return options.image_size, options.image_size
-    scale = min(1.0, options.image_size / min(stored))
-    return max(1, round(stored[0] * scale)), max(1, round(stored[1] * scale))
 
 
 def _parser_of(path: pathlib.Path) -> str | None:

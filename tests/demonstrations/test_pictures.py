@@ -1,0 +1,141 @@
+"""Folders of pictures, NumPy images, and what is done with unlike shapes and rates."""
+
+import logging
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxil.demonstrations import loading
+from jaxil.demonstrations.readers import pictures
+from jaxil.demonstrations.readers.frames import resized
+from jaxil.demonstrations.readers.recording import FormatError
+from jaxil.demonstrations.states import DemonstrationError
+from jaxil.environments import tasks
+from tests.demonstrations import foreign_files
+from tests.demonstrations.foreign_files import encode_video, read_here
+
+TASK = "cartpole_swingup"  # 100 frames a second
+FRAMES = np.random.default_rng(0).integers(0, 256, (12, 8, 8, 3), dtype=np.uint8)
+GRAY = FRAMES[..., 0]
+
+
+def load(path, **changes):
+    settings = {
+        "task": TASK,
+        "num_episodes": 1,
+        "action_repeat": 2,
+        "image_size": 8,
+        "render_quality": "fast",
+    }
+    return loading.load(path, **(settings | changes))
+
+
+@pytest.mark.parametrize(
+    ("images", "expected"),
+    [
+        (FRAMES, FRAMES),
+        (GRAY, GRAY[..., None].repeat(3, axis=3)),
+        (GRAY[..., None], GRAY[..., None].repeat(3, axis=3)),
+        (np.concatenate([FRAMES, FRAMES[..., :1]], axis=3), FRAMES),
+        (FRAMES.astype(np.uint16) * 257, FRAMES),
+        (FRAMES.astype(np.float32) / 255.0, FRAMES),
+    ],
+    ids=["rgb", "gray", "one channel", "rgba", "uint16", "float"],
+)
+def test_arrays_of_many_kinds(images, expected, tmp_path):
+    path = tmp_path / "images.npy"
+    np.save(path, images)
+    _, (episode,) = read_here(pictures, path)
+    np.testing.assert_array_equal(episode.frames, expected)
+
+
+@pytest.mark.parametrize(
+    ("images", "message"),
+    [
+        (FRAMES.astype(np.float32), "outside"),
+        (FRAMES.transpose(0, 3, 1, 2), "has shape"),
+        (FRAMES.astype(np.int64), "type int64"),
+    ],
+)
+def test_other_arrays_are_refused(images, message, tmp_path):
+    path = tmp_path / "images.npy"
+    np.save(path, images)
+    with pytest.raises(FormatError, match=message):
+        read_here(pictures, path)
+
+
+def test_pictures_are_read_in_the_order_of_their_numbers(tmp_path):
+    for index, frame in enumerate(FRAMES):
+        Image.fromarray(frame).save(tmp_path / f"frame{index}.png")
+    (tmp_path / "notes.txt").write_text("about them")
+    _, (episode,) = read_here(pictures, tmp_path)
+    np.testing.assert_array_equal(episode.frames, FRAMES)
+    deep = Image.fromarray(GRAY[0].astype(np.uint16) * 257)
+    deep.save(tmp_path / "frame0.png")
+    _, (episode,) = read_here(pictures, tmp_path)
+    np.testing.assert_array_equal(episode.frames[0], GRAY[0][..., None].repeat(3, 2))
+
+
+def test_shapes_become_squares_in_three_ways():
+    frame = np.zeros((6, 12, 3), np.uint8)
+    frame[:, :3] = 100
+    frame[:, 3:9] = 200
+    assert set(np.unique(resized(frame, (6, 6), "crop"))) == {200}
+    padded = resized(frame, (12, 12), "pad")
+    assert padded[0].max() == padded[-1].max() == 0
+    np.testing.assert_array_equal(padded[3:9], frame)
+    assert resized(frame, (6, 6))[:, 0].max() <= 130
+
+
+@pytest.mark.parametrize("fps", [30, 50, 100, 120])
+def test_videos_are_sampled_by_time(fps, tmp_path):
+    path = tmp_path / "video.mp4"
+    encode_video(path, FRAMES.repeat(2, axis=1).repeat(2, axis=2), fps=fps)
+    loaded = load(path, sampling="time", image_size=16)
+    seconds, _ = tasks.timing(TASK, 2)
+    num_steps = int(11 / fps / seconds + 1e-6)  # type: ignore[operator]
+    assert loaded.frames.shape[1] == num_steps + 1
+    for step, frame in enumerate(loaded.frames[0]):
+        shown = FRAMES[round(step * seconds * fps + 1e-9)]  # type: ignore[operator]
+        np.testing.assert_array_equal(frame[::2, ::2], shown)
+
+
+def test_what_has_no_rate_is_sampled_by_its_stated_action_repeat(tmp_path):
+    path = tmp_path / "images.npy"
+    np.save(path, FRAMES)
+    with pytest.raises(DemonstrationError, match=r"demonstrations\.action_repeat"):
+        load(path, sampling="time")
+    loaded = load(path, sampling="time", stated_action_repeat=1)
+    np.testing.assert_array_equal(loaded.frames[0], FRAMES[:11:2])
+
+
+def test_a_default_number_of_episodes_takes_what_there_is(tmp_path, caplog):
+    path = tmp_path / "images.npy"
+    np.save(path, FRAMES)
+    with pytest.raises(DemonstrationError, match=r"demonstrations\.num_episodes=1"):
+        load(path, num_episodes=10)
+    with caplog.at_level(logging.WARNING):
+        assert len(load(path, num_episodes=10, takes_fewer=True).frames) == 1
+    assert "1 of 10 episodes" in caplog.text
+
+
+def test_what_cannot_be_learned_from_is_warned_of(tmp_path, caplog):
+    still = tmp_path / "still.npy"
+    np.save(still, FRAMES[:1].repeat(4, axis=0))
+    with caplog.at_level(logging.WARNING):
+        load(still)
+    assert "nothing ever changes: 0" in caplog.text
+    assert "3 steps, but the task's 500" in caplog.text
+    own = tmp_path / "own.npz"
+    foreign_files.write_own(own, 1)
+    with np.load(own) as stored:
+        arrays = dict(stored)
+    arrays["actions_0"] = arrays["actions_0"] * 3
+    arrays["rewards_0"] = arrays["rewards_0"] * 0
+    np.savez(own, **arrays)
+    caplog.clear()
+    with caplog.at_level(logging.WARNING):
+        load(own)
+    assert "but the agent's lie in [-1, 1]" in caplog.text
+    assert "task return is 0" in caplog.text
