@@ -147,7 +147,7 @@ def test_a_method_from_outside_trains(package, tmp_path):
         *small_run("zero", workdir),
         "--config.method=my_method:METHOD",
         "--config.brightness.weight=0.5",
-        "--config.total_frames=2000",
+        "--config.total_frames=1000",
     )
     assert finished.returncode == 0, finished.stderr
     header, first, *_ = (workdir / "train.csv").read_text().splitlines()

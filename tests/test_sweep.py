@@ -17,7 +17,7 @@ from jaxil.training import workdir
 from launch.sweeps import clusters, plan, state, tables
 from launch.sweeps.clusters import Cluster
 from launch.sweeps.state import State, Status
-from tests.commands import ROOT, SMALL
+from tests.commands import ROOT, SMALL, STATES
 from tests.trainer import FRAMES, stand_in
 
 _SECONDS = 100.0  # for what takes two on an idle machine
@@ -467,8 +467,7 @@ def test_real_runs_from_the_plan_to_the_table(tmp_path):
     flags = [
         *("--methods=drqv2", "--preset=tiny", "--tasks=ball_in_cup_catch"),
         *("--seeds=1", "--workers=1", f"--workdir={tmp_path}", *SMALL),
-        *("--config.observation=state", "--config.encoder.subtract_mean_image=False"),
-        "--config.total_frames=2000",
+        *(*STATES, "--config.total_frames=2000"),
     ]
     planned = _sweep(*flags, "--dry_run")
     assert planned.returncode == 0, planned.stderr
