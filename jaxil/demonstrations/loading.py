@@ -46,87 +46,90 @@ class Demonstrations(NamedTuple):
         return float(np.mean(returns)) if returns else None
 
 
+class Wanted(NamedTuple):
+    """What a run needs of its demonstrations.
+
+    Attributes:
+      task: such as "walker_walk".
+      num_episodes: loads the file's first ones.
+      action_repeat: the agent's; a multiple of the one in a file of states. Rewards of
+        merged steps are summed, and the first action is kept.
+      image_size: height and width of the frames.
+      observation: "pixels" or "state".
+      frame_skip: keeps every n-th frame of a file of pixels.
+      max_bytes: memory limit for a file of pixels.
+    """
+
+    task: str
+    num_episodes: int
+    action_repeat: int
+    image_size: int = 84
+    observation: str = "pixels"
+    frame_skip: int = 1
+    max_bytes: int = archive.MAX_BYTES
+
+
 def check(
-    source: str | os.PathLike,
-    *,
-    task: str,
-    num_episodes: int,
-    action_repeat: int,
-    image_size: int = 84,
-    observation: str = "pixels",
-    frame_skip: int = 1,
-    max_bytes: int = archive.MAX_BYTES,
-    sees_actions: bool = False,
+    source: str | os.PathLike, *, sees_actions: bool = False, **wanted: Any
 ) -> None:
     """Raises what `load` would raise, without rendering anything.
 
-    `sees_actions` tells whether the method needs the expert's actions; for the other
-    arguments see `load`.
+    Args:
+      source: see `load`.
+      sees_actions: whether the method needs the expert's actions.
+      wanted: the fields of `Wanted`.
     """
-    path = _path_of(source, task)
+    request = Wanted(**wanted)
+    path = _path_of(source, request.task)
     if states.recognises(path):
-        _open_states(path, task, num_episodes, action_repeat, frame_skip)
+        _open_states(path, request)
         return
-    loaded = _load_pixels(
-        path, task, num_episodes, image_size, observation, frame_skip, max_bytes
-    )
+    loaded = _load_pixels(path, request)
     if not sees_actions:
         return
     if loaded.actions is None:
         raise fault(path, "holds no actions", "Use a method that needs none")
-    needed = _model_sizes(task)["actions"]
+    needed = _model_sizes(request.task)["actions"]
     if loaded.actions.shape[2] != needed:
         what = f"has actions of {loaded.actions.shape[2]} numbers"
         way_out = "Use a method that needs no actions"
-        raise fault(path, f"{what}, but {task} needs {needed}", way_out)
+        raise fault(path, f"{what}, but {request.task} needs {needed}", way_out)
 
 
 def load(
     source: str | os.PathLike,
     *,
-    task: str,
-    num_episodes: int,
-    action_repeat: int,
-    image_size: int,
     render_quality: str,
-    observation: str = "pixels",
-    frame_skip: int = 1,
-    max_bytes: int = archive.MAX_BYTES,
     cache: bool = True,
     progress: Callable[[int, int], None] | None = None,
+    **wanted: Any,
 ) -> Demonstrations:
     """Loads demonstrations; states are rendered by the agent's own environment.
-
-    Arguments not listed are those of `suite.make_environment`.
 
     Args:
       source: a file or folder of any format in `foreign.FORMATS`; "" for the task's
         shipped states.
-      num_episodes: loads the file's first ones.
-      action_repeat: the agent's; a multiple of the one in a file of states. Rewards of
-        merged steps are summed, and the first action is kept.
-      frame_skip: keeps every n-th frame of a file of pixels.
-      max_bytes: memory limit for a file of pixels.
+      render_quality: see `suite.make_environment`.
       cache: whether to cache rendered images.
+      wanted: the fields of `Wanted`.
       progress: called with (images done, all images) while rendering.
 
     Raises:
       DemonstrationError: the file cannot be read, is damaged, or does not fit.
     """
-    path = _path_of(source, task)
+    request = Wanted(**wanted)
+    path = _path_of(source, request.task)
     if not states.recognises(path):
-        loaded = _load_pixels(
-            path, task, num_episodes, image_size, observation, frame_skip, max_bytes
-        )
+        loaded = _load_pixels(path, request)
         mismatch.warn_of_pixels(
             path,
             loaded.metadata,
-            image_size=image_size,
-            task=task,
-            action_repeat=action_repeat,
+            image_size=request.image_size,
+            task=request.task,
+            action_repeat=request.action_repeat,
         )
         return loaded
-    stored, stride = _open_states(path, task, num_episodes, action_repeat, frame_skip)
+    stored, stride = _open_states(path, request)
     metadata = stored.metadata
     mismatch.warn_of_versions(path, metadata["versions"])
     num_steps = stored.rewards.shape[1] // stride
@@ -134,22 +137,22 @@ def load(
     try:
         frames = rendering.observe_episodes(
             stored.simulator_states(slice(0, used + 1, stride)),
-            task=task,
+            task=request.task,
             seed=metadata["seed"],
             first_episode=metadata["first_episode"],
-            image_size=image_size,
+            image_size=request.image_size,
             render_quality=render_quality,
-            observation=observation,
+            observation=request.observation,
             cache=cache,
             progress=progress,
         )
     except ValueError as error:
         raise fault(path, f"cannot be rendered ({error})") from error
-    rewards = stored.rewards[:, :used].reshape(num_episodes, num_steps, stride).sum(2)
-    served = {"file": str(path), "action_repeat": action_repeat}
+    rewards = stored.rewards[:, :used].reshape(len(frames), num_steps, stride).sum(2)
+    served = {"file": str(path), "action_repeat": request.action_repeat}
     return Demonstrations(
         frames,
-        np.full(num_episodes, num_steps + 1),
+        np.full(len(frames), num_steps + 1),
         stored.actions[:, :used:stride],
         rewards,
         {**metadata, **served, "returns": _returns(rewards)},
@@ -163,49 +166,19 @@ def sample(
     *,
     frame_stack: int,
     successors: bool = False,
+    as_indices: bool = False,
 ) -> ExpertBatch:
     """Samples observations and their actions uniformly from all steps.
 
     Args:
-      demonstrations: whole episodes.
-      rng: random generator.
-      batch_size: B.
       frame_stack: frames in an observation; the first is repeated at the start.
       successors: whether to add the next observations.
+      as_indices: whether observations are the int32 [B, frame_stack] indices of their
+        frames, oldest first, in all episodes end to end, [K * (N + 1), ...].
 
     Returns:
       Observations uint8 [B, H, W, 3 * frame_stack] or float32 [B, S], and actions
       [B, A]; A is 0 if they are unknown.
-    """
-    found = sample_indices(
-        demonstrations,
-        rng,
-        batch_size,
-        frame_stack=frame_stack,
-        successors=successors,
-    )
-    # All episodes end to end, without a copy.
-    frames = demonstrations.frames.reshape(-1, *demonstrations.frames.shape[2:])
-    successor = found.successor
-    return found._replace(
-        observation=gather_stacks(frames, found.observation),
-        successor=None if successor is None else gather_stacks(frames, successor),
-    )
-
-
-def sample_indices(
-    demonstrations: Demonstrations,
-    rng: np.random.Generator,
-    batch_size: int,
-    *,
-    frame_stack: int,
-    successors: bool = False,
-) -> ExpertBatch:
-    """Samples like `sample`, with frame indices instead of pixels.
-
-    Returns:
-      Observations int32 [B, frame_stack]: indices, oldest first, into the frames of all
-      episodes end to end, [K * (N + 1), ...].
     """
     num_steps = demonstrations.num_frames - 1  # no action follows the last frame
     ends = np.cumsum(num_steps)
@@ -225,7 +198,12 @@ def sample_indices(
         else demonstrations.actions[episodes, steps]
     )
     successor = stacks(steps + 1) if successors else None
-    return ExpertBatch(stacks(steps), actions, successor)
+    batch = ExpertBatch(stacks(steps), actions, successor)
+    if as_indices:
+        return batch
+    # All episodes end to end, without a copy.
+    frames = demonstrations.frames.reshape(-1, *demonstrations.frames.shape[2:])
+    return batch.map_observations(lambda each: gather_stacks(frames, each))
 
 
 def _path_of(source: str | os.PathLike, task: str) -> pathlib.Path:
@@ -239,20 +217,17 @@ def _returns(task_rewards: np.ndarray | None) -> list[float]:
 
 
 def _open_states(
-    path: pathlib.Path,
-    task: str,
-    num_episodes: int,
-    action_repeat: int,
-    frame_skip: int,
+    path: pathlib.Path, request: Wanted
 ) -> tuple[StateDemonstrations, int]:
     """Returns a file's content, and the stored steps per agent step."""
-    stored = states.read_states(path, task=task, num_episodes=num_episodes)
+    task, action_repeat = request.task, request.action_repeat
+    stored = states.read_states(path, task=task, num_episodes=request.num_episodes)
     recorded = stored.metadata["action_repeat"]
     if action_repeat < 1 or action_repeat % recorded:
         what = f"was recorded with action_repeat={recorded}, not {action_repeat}"
         raise fault(path, what, f"Use a multiple of {recorded}, or record it again")
-    if frame_skip != 1:
-        what = f"holds states, but frame_skip={frame_skip} is for pixels"
+    if request.frame_skip != 1:
+        what = f"holds states, but frame_skip={request.frame_skip} is for pixels"
         raise fault(path, what, "Set demonstrations.frame_skip to 1")
     stride = action_repeat // recorded
     if stride > stored.rewards.shape[1]:
@@ -265,31 +240,29 @@ def _open_states(
     return stored, stride
 
 
-def _load_pixels(path: pathlib.Path, *request: Any) -> Demonstrations:
+def _load_pixels(path: pathlib.Path, request: Wanted) -> Demonstrations:
     """Reads a file of pixels, or returns it again if it was the last one read."""
     try:
         parts = sorted(path.rglob("*")) if path.is_dir() else [path]
         stamps = tuple((str(part), part.stat().st_mtime_ns) for part in parts)
     except OSError as error:
         raise unreadable(path, error) from error
-    return _read_pixels(path, stamps, *request)
+    return _read_pixels(path, stamps, request)
 
 
 # `check` and `load` share one reading. The run keeps these pixels in memory anyway.
 @functools.lru_cache(maxsize=1)
 def _read_pixels(
-    path: pathlib.Path,
-    stamps: tuple[tuple[str, int], ...],
-    task: str,
-    num_episodes: int,
-    image_size: int,
-    observation: str,
-    frame_skip: int,
-    max_bytes: int,
+    path: pathlib.Path, stamps: tuple[tuple[str, int], ...], request: Wanted
 ) -> Demonstrations:
     del stamps  # part of the key only
-    if observation != "pixels":
-        what = f"holds pixels or is damaged, but observation={observation!r}"
+    task, num_episodes, frame_skip = (
+        request.task,
+        request.num_episodes,
+        request.frame_skip,
+    )
+    if request.observation != "pixels":
+        what = f"holds pixels or is damaged, but observation={request.observation!r}"
         raise fault(path, what, "Set observation to 'pixels', or use a file of states")
     if num_episodes < 1 or frame_skip < 1:
         what = f"does not fit num_episodes={num_episodes} and frame_skip={frame_skip}"
@@ -298,9 +271,9 @@ def _read_pixels(
         read = foreign.read_episodes(
             path,
             num_episodes=num_episodes,
-            image_size=image_size,
+            image_size=request.image_size,
             frame_skip=frame_skip,
-            max_bytes=max_bytes,
+            max_bytes=request.max_bytes,
         )
     except OSError as error:
         raise unreadable(path, error) from error

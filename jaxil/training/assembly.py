@@ -23,7 +23,7 @@ from jaxil.training.agent import native_fault, stack_size
 
 # Added to the seed for what must not share its random starts with training.
 _EVALUATION_SEED = 1_000_003
-# A fault in one of these leaves no sense in opening the demonstrations.
+# With a fault in one of these, the demonstrations are not opened.
 _READING_FIELDS = {
     "method",
     "task",
@@ -61,7 +61,7 @@ def problems(config: Config) -> list[Fault]:
 
 
 def demonstration_fault(config: Config) -> str | None:
-    """Returns why the config's demonstrations can't serve it; None if they can."""
+    """Returns why a run cannot use its demonstrations; None if it can."""
     try:
         loading.check(
             config.demonstrations.source,
@@ -74,10 +74,10 @@ def demonstration_fault(config: Config) -> str | None:
 
 
 def renderer_name(config: Config) -> str:
-    """Returns what GL calls the device that will draw this run's pixels.
+    """Returns what GL calls the device that renders this run's pixels.
 
     Raises:
-      RuntimeError: nothing here can render.
+      RuntimeError: no GL backend works.
     """
     environment = training_environment(config)
     name = environment.renderer.gl_name()
@@ -91,7 +91,7 @@ def training_environment(config: Config) -> PixelEnvironment:
 
 
 def evaluation_environment(config: Config) -> PixelEnvironment:
-    """Returns an environment of its own, with starts of its own."""
+    """Returns a separate environment, with starts that training does not use."""
     return environment_with_seed(config, config.seed + _EVALUATION_SEED)
 
 
@@ -114,8 +114,7 @@ def make_player(
     Args:
       config: checked.
       environment: the training environment; several are made like it.
-      first_episode: see `Player`.
-      open_episodes: see `Player`.
+      first_episode: see `Player`, as for `open_episodes`.
       timed: wraps the environments, to measure their time.
       say: takes a line for people.
     """
@@ -123,19 +122,15 @@ def make_player(
         return None
     environments: Any = InProcess(environment)
     if config.num_environments > 1:
-        # All have one seed: an episode's number alone fixes its start. The child finds
-        # what this names without jax, which would take memory and seconds.
+        # All have one seed: an episode's number alone determines its start. The child
+        # imports this without jax, which would take memory and seconds.
         make = functools.partial(
             make_environment,
             config.task,
             seed=config.seed,
             **_environment_settings(config),
         )
-        environments = Pool(
-            make,
-            config.num_environments,
-            say=say,
-        )
+        environments = Pool(make, config.num_environments, say=say)
     return Player(
         timed(environments), first_episode=first_episode, open_episodes=open_episodes
     )
@@ -151,16 +146,14 @@ def _environment_settings(config: Config) -> dict[str, Any]:
     }
 
 
-def load_demonstrations(
-    config: Config,
-) -> loading.Demonstrations | None:
-    """Returns the demonstrations of a run, rendered as the agent sees; or None.
+def load_demonstrations(config: Config) -> loading.Demonstrations | None:
+    """Returns a run's demonstrations, rendered as the agent sees them; or None.
 
-    Drawing them takes minutes at quality `paper` in software, the first time: a
-    progress line is shown.
+    The first time, rendering takes minutes in software at quality `paper`, so it shows
+    its progress.
 
     Raises:
-      DemonstrationError: the file can't serve this run.
+      DemonstrationError: the run cannot use the file.
     """
     if not jaxil_config.uses_demonstrations(config):
         return None
@@ -168,7 +161,7 @@ def load_demonstrations(
 
     def show(done: int, total: int) -> None:
         if not lines:
-            label = "drawing the demonstrations, once"
+            label = "rendering the demonstrations, once"
             lines.append(
                 ProgressLine(total, first_frame=done, label=label, unit="images")
             )
@@ -187,7 +180,7 @@ def load_demonstrations(
 
 
 def _file_settings(config: Config) -> dict[str, Any]:
-    """Returns what decides whether a demonstration file can serve a run."""
+    """Returns what a run needs of its demonstrations, see `loading.Wanted`."""
     return {
         "task": config.task,
         "num_episodes": config.demonstrations.num_episodes,

@@ -11,7 +11,7 @@ from jaxil.environments.suite import PixelEnvironment
 from jaxil.learner.state import TrainState
 from jaxil.maths.types import Episode, ExpertEpisodes
 from jaxil.training.agent import Agent
-from jaxil.training.expert_distance import Closeness
+from jaxil.training.expert_distance import ExpertDistance
 
 
 class Result(NamedTuple):
@@ -37,7 +37,7 @@ class Evaluator:
         agent: Agent,
         environment: PixelEnvironment,
         experts: ExpertEpisodes | None,
-        distance: Closeness | None,
+        distance: ExpertDistance | None,
     ) -> None:
         """See `parts.make_parts`."""
         self._config = config

@@ -39,7 +39,7 @@ _LAYERS = ((3, 2), (3, 1), (3, 1), (3, 1))  # kernel and stride, as DrQ-v2's
 _DEFINITION = "debiased Sinkhorn divergence of 64 moments an episode"
 
 
-class Closeness:
+class ExpertDistance:
     """Measures the distance to the expert, relative to a random policy's.
 
         S(moments of an evaluation, moments of the demonstrations)

@@ -152,24 +152,22 @@ class Updates:
         """Samples what one update learns from."""
         rewarder, batch = self._agent.rewarder, None
         if self._plays:
-            on_host = self._device_copy is None
-            sample = self._replay.sample if on_host else self._replay.sample_indices
-            batch = sample(
+            batch = self._replay.sample(
                 rng,
                 self._config.batch_size,
                 windows=rewarder.relabel is not None,
                 successors=rewarder.samples_successors,
+                as_indices=self._device_copy is not None,
             )
         if not rewarder.expert_batch_size:
             return batch, None
         assert self._demonstrations is not None
-        on_host = self._expert_frames is None
-        sample = loading.sample if on_host else loading.sample_indices
-        expert = sample(
+        expert = loading.sample(
             self._demonstrations,
             rng,
             rewarder.expert_batch_size,
             frame_stack=stack_size(self._config),
             successors=rewarder.samples_successors,
+            as_indices=self._expert_frames is not None,
         )
         return batch, expert

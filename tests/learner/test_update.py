@@ -567,8 +567,8 @@ def test_noise_follows_the_number_of_the_update(num_updates, std):
 
 @pytest.mark.parametrize(
     ("rewarder", "expert"),
-    [(DRQV2, None), (PDAC, make_expert), (PSIL, None)],
-    ids=["drqv2", "pdac", "psil"],
+    [(PDAC, make_expert), (PSIL, None)],
+    ids=["pdac", "psil"],
 )
 def test_compiles_once_and_donates_its_state(rewarder, expert):
     learner = make_learner(rewarder)

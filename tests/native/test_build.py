@@ -3,7 +3,6 @@
 import configparser
 import os
 import pathlib
-import shutil
 import stat
 import subprocess
 import sys
@@ -123,10 +122,10 @@ def test_other_flags_are_another_library(tmp_path):
     assert len(os.listdir(tmp_path)) == 2
 
 
+@pytest.mark.usefixtures("quick_compiler")
 def test_the_users_compiler_is_taken_with_its_options(tmp_path, monkeypatch):
     seen = tmp_path / "seen"
-    real = shutil.which("gcc")
-    script = f'echo "$1" > {seen}; shift; exec {real} "$@"'
+    script = f'echo "$1" > {seen}; shift; exec {os.environ["CC"]} "$@"'
     monkeypatch.setenv("CC", compiler_that(tmp_path, script) + " --first")
     assert build.build(tmp_path / "cache").exists()
     assert seen.read_text() == "--first\n"

@@ -139,7 +139,7 @@ class ByHandTest(chex.TestCase):
         np.testing.assert_array_equal(to_unit, np.full(to_unit.shape, 15.0 * 9 * 32))
 
 
-@settings(derandomize=True, max_examples=40, deadline=None)
+@settings(derandomize=True, max_examples=12, deadline=None)
 @given(data=st.data())
 def test_value_and_gradients_of_any_encoder(data):
     layers, height, width = [], 1, 1
