@@ -124,7 +124,7 @@ def declaration(name: str) -> Method:
     """Returns a method's declaration; of one that is not installed, its name only."""
     try:
         return methods.get(name)
-    except (Exception, SystemExit):  # whatever importing somebody's file raises
+    except (Exception, SystemExit):  # an imported file may raise anything
         return Method(name=name, label=name, about=_MISSING)
 
 

@@ -215,7 +215,7 @@ def make_agent(
         refresh=jax.jit(make_refresh(rewarder)),
         plan=None if rewarder.plan is None else jax.jit(rewarder.plan),
         rewarder=rewarder,
-        # Compiled, and kept in the cache: one by one, its 450 operations take longer.
+        # Compiled and cached: its 450 operations take longer when run one by one.
         init_state=jax.jit(
             lambda: init_train_state(
                 learner, jax.random.key(config.seed), observation, spec

@@ -116,7 +116,7 @@ def make_player(
       environment: the training environment; several are made like it.
       first_episode: see `Player`, as for `open_episodes`.
       timed: wraps the environments, to measure their time.
-      say: takes a line for people.
+      say: prints a line.
     """
     if not methods.get(config.method).plays:
         return None

@@ -1,4 +1,4 @@
-"""Evaluations of a run: episodes of the mean action, and how the method sees them."""
+"""Evaluations of a run: episodes of the mean action, with their imitation rewards."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -93,11 +93,11 @@ class Evaluator:
         return Result(evaluation, distance, filmed)
 
     def explain(self, state: TrainState, episode: Episode) -> dict[str, np.ndarray]:
-        """Returns what the method makes of an episode, to look at.
+        """Returns an episode's rewards and transport plan, for videos and reports.
 
         Returns:
           `task_rewards` [T], `imitation_rewards` [T], and the transport plan
-          `plan` [T + 1, N + 1] of methods that have one.
+          `plan` [T + 1, N + 1] if the method has one.
         """
         arguments = (state.rewarder, state.params, episode, self._experts)
         found = {

@@ -80,17 +80,17 @@ def read(folder: pathlib.Path) -> tuple[dict, dict[str, np.ndarray]]:
     """Reads the record and the learner's arrays by name, those of keys as numbers.
 
     Raises:
-      ValueError: a file is missing, or not as it was written.
+      ValueError: a file is missing or has changed.
     """
     import orbax.checkpoint as ocp
 
     try:
-        # Before orbax sees it: on a damaged file, orbax leaves tracebacks of its
-        # threads on the screen, and a change within an array passes unnoticed. Files
-        # that were not there then, such as a file manager's, do not matter.
+        # Checked before orbax reads it: on a damaged file, orbax's threads print
+        # tracebacks, and a change within an array goes unnoticed. Files that were added
+        # later, such as a file manager's, do not matter.
         expected = json.loads((folder / _CHECKSUMS).read_text())
         if not expected or _checksums(folder, expected) != expected:
-            raise ValueError("its files are not as they were written")
+            raise ValueError("its files have changed since they were written")
         with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
             restored = checkpointer.restore(
                 folder,
@@ -102,7 +102,7 @@ def read(folder: pathlib.Path) -> tuple[dict, dict[str, np.ndarray]]:
         for name, leaf in restored.record["leaves"].items():
             array = np.asarray(restored.learner.get(name, ()), leaf["dtype"])
             arrays[name] = array.reshape(leaf["shape"])
-    except Exception as error:  # orbax and tensorstore raise whatever they meet
+    except Exception as error:  # orbax and tensorstore raise many kinds
         raise ValueError(_one_line(error)) from error
     return restored.record, arrays
 

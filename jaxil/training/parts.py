@@ -102,7 +102,7 @@ def make_parts(
       config: checked.
       workdir: the run's folder.
       demonstrations: what the method imitates, or None.
-      say: takes a line for people.
+      say: prints a line.
     """
     environment = assembly.training_environment(config)
     agent = agents.make_agent(config, environment, demonstrations)

@@ -1,4 +1,4 @@
-"""A policy that a run has learned, taken from its newest checkpoint."""
+"""The policy in a run's newest checkpoint."""
 
 import pathlib
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from jaxil.training.checkpoint import CheckpointError, Checkpoints
 
 
 class Trained(NamedTuple):
-    """A learned policy and what it takes to play it."""
+    """A learned policy and its environment."""
 
     config: Config
     environment: PixelEnvironment  # a separate one, not the training's
@@ -29,7 +29,7 @@ class Trained(NamedTuple):
     seconds: float  # wall clock of the training
 
     def description(self) -> str:
-        """Returns a few words on the training."""
+        """Returns a short description of the training."""
         config = self.config
         return (
             f"{config.method} learner on {config.observation}, seed {config.seed}, "
