@@ -4,8 +4,6 @@ import ast
 import inspect
 import os
 import pathlib
-import subprocess
-import sys
 
 import pytest
 
@@ -13,6 +11,7 @@ from jaxil import config as jaxil_config
 from jaxil import methods
 from jaxil.errors import UsageError
 from tests.commands import ROOT, run, small_run
+from tests.processes import run_python
 
 _DECLARED = {
     path.stem: path
@@ -51,20 +50,6 @@ def make_rewarder(agent, *, weight):
 
     return Rewarder(rewards, summary=lambda state: {"brightness/weight": weight})
 '''
-
-
-def python(source: str) -> str:
-    """Runs a program in a process of its own; returns what it prints."""
-    finished = subprocess.run(
-        [sys.executable, "-c", source],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60.0,
-    )
-    assert finished.returncode == 0, finished.stderr
-    return finished.stdout
 
 
 # Our own -----------------------------------------------------------------------
@@ -115,7 +100,7 @@ def test_labels_ranks_and_colours_are_unique():
 
 
 def test_declarations_are_read_without_jax():
-    printed = python(
+    printed = run_python(
         "import sys\n"
         "from jaxil import config, methods\n"
         "[config.default_config(name) for name in methods.known()]\n"
@@ -183,7 +168,7 @@ def test_installed_packages_name_methods_by_entry_points(package):
         # The second has a name that is taken: ours stays.
         "[jaxil.methods]\nbright = my_method:METHOD\npdac = my_method:METHOD\n"
     )
-    printed = python(
+    printed = run_python(
         "import sys\n"
         "from jaxil import config, methods\n"
         "bright = methods.known()['bright']\n"

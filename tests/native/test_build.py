@@ -4,8 +4,6 @@ import configparser
 import os
 import pathlib
 import stat
-import subprocess
-import sys
 
 import jax
 import pytest
@@ -16,6 +14,7 @@ from jaxil.machine import cache
 from jaxil.native import build
 from jaxil.training import agent as agents
 from jaxil.training import assembly
+from tests.processes import run_python
 
 NOT_FOR_THESE = (
     {"compute_dtype": "bfloat16"},
@@ -92,7 +91,7 @@ def test_a_damaged_library_is_rebuilt(tmp_path, damage):
     flipped = whole[:half] + bytes([whole[half] ^ 1]) + whole[half + 1 :]
     path.write_bytes({"empty": b"", "truncated": whole[:half]}.get(damage, flipped))
     # Loading it would kill the process.
-    subprocess.run([sys.executable, "-c", _LOAD, str(tmp_path)], check=True)
+    run_python(_LOAD, str(tmp_path))
     assert build._is_whole(path)
     assert os.listdir(tmp_path) == [path.name]
 
