@@ -11,25 +11,27 @@ import pytest
 
 from jaxil.files.tables import read_csv
 from jaxil.training import expert_distance
-from tests.commands import ROOT, STATES, arguments, call, run, small_run
+from tests.commands import ROOT, STATES, arguments, call, small_run
 
 _CLOCKS = ("seconds", "frames_per_second", "reward_seconds")
 # Rewards are refreshed at frames 2000 and 4000.
 _REFRESH = "--config.reward_refresh_steps=150"
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _quick_distance():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(expert_distance, "_RANDOM_EPISODES", 1)
+        yield
+
+
 @pytest.fixture(name="unbroken", scope="module")
 def _unbroken(tmp_path_factory):
     """The folder of a whole P-DAC run."""
     workdir = tmp_path_factory.mktemp("unbroken")
-    finished = run("launch", *small_run("pdac", workdir), _REFRESH)
+    finished = call("launch", *small_run("pdac", workdir), _REFRESH)
     assert finished.returncode == 0, finished.stderr
     return workdir
-
-
-@pytest.fixture(name="quick_distance")
-def _quick_distance(monkeypatch):
-    monkeypatch.setattr(expert_distance, "_RANDOM_EPISODES", 1)
 
 
 def test_pdac_trains_shows_itself_and_is_evaluated_again(unbroken):
@@ -85,7 +87,7 @@ def test_resumes_bit_for_bit_after_a_kill(unbroken, tmp_path):
 
 
 @pytest.mark.parametrize("method", ["psil", "sil", "dac"])
-def test_method_trains(method, tmp_path, quick_distance):
+def test_method_trains(method, tmp_path):
     flags = (*small_run(method, tmp_path), "--config.total_frames=2000")
     finished = call("launch", *flags)
     assert finished.returncode == 0, finished.stderr
@@ -102,7 +104,7 @@ def test_method_trains(method, tmp_path, quick_distance):
         np.testing.assert_allclose(filmed["plan"].sum(axis=1), 1 / 101, rtol=1e-3)
 
 
-def test_cloning_learns_without_playing(tmp_path, quick_distance):
+def test_cloning_learns_without_playing(tmp_path):
     finished = call(
         "launch",
         *small_run("bc", tmp_path),
@@ -121,7 +123,7 @@ def test_cloning_learns_without_playing(tmp_path, quick_distance):
     )
 
 
-def test_state_expert_is_recorded_and_imitated(tmp_path, quick_distance):
+def test_state_expert_is_recorded_and_imitated(tmp_path):
     expert = tmp_path / "expert"
     trained = call(
         "launch",

@@ -497,7 +497,7 @@ def test_successors_come_augmented_with_their_features_and_change_nothing_else()
 
 
 def with_actor_loss(actor_loss) -> Learner:
-    return make_learner(DRQV2._replace(actor_loss=actor_loss), exploration_std=QUIET)
+    return make_learner(DRQV2._replace(actor_loss=actor_loss))
 
 
 def test_a_term_in_the_actors_loss_pulls_the_policy_and_nothing_else():
@@ -528,15 +528,6 @@ def test_a_term_in_the_actors_loss_pulls_the_policy_and_nothing_else():
     )
     assert any_difference(pulled.actor, plain.actor)
     assert_identical(pulled.replace(actor=()), plain.replace(actor=()))
-
-
-def test_a_term_of_zero_changes_nothing():
-    zero = with_actor_loss(lambda state, learner, agent, expert, key: jnp.zeros(()))
-    first, second = (
-        jitted(learner)(make_state(learner), make_batch(0), None)
-        for learner in (zero, with_actor_loss(None))
-    )
-    assert_identical(first, second)
 
 
 # Keys, schedules, compilation --------------------------------------------------
