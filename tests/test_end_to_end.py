@@ -13,45 +13,61 @@ import pytest
 import jaxil
 from jaxil import export
 from jaxil.files.tables import read_csv
-from tests.commands import ROOT, arguments, run, small_run
+from jaxil.training import expert_distance
+from tests.commands import ROOT, STATES, arguments, call, small_run
 
 _CLOCKS = ("seconds", "frames_per_second", "reward_seconds")
+# Rewards are refreshed at frames 2000 and 4000.
+_REFRESH = "--config.reward_refresh_steps=150"
 
 
-def test_pdac_trains_shows_itself_and_is_evaluated_again(tmp_path):
-    finished = run("launch", *small_run("pdac", tmp_path))
+@pytest.fixture(scope="module", autouse=True)
+def _quick_distance():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(expert_distance, "_RANDOM_EPISODES", 1)
+        yield
+
+
+@pytest.fixture(name="unbroken", scope="module")
+def _unbroken(tmp_path_factory):
+    """The folder of a whole P-DAC run."""
+    workdir = tmp_path_factory.mktemp("unbroken")
+    finished = call("launch", *small_run("pdac", workdir), _REFRESH)
     assert finished.returncode == 0, finished.stderr
+    return workdir
 
-    train = read_csv(tmp_path / "train.csv")
+
+def test_pdac_trains_shows_itself_and_is_evaluated_again(unbroken):
+    train = read_csv(unbroken / "train.csv")
     np.testing.assert_array_equal(train["frame"], [1000, 2000, 3000, 4000])
     assert np.all(train["length"] == 100)
     assert np.all(np.isfinite(train["imitation_return"]))
     assert np.all(np.isfinite(train["discriminator/expert_logit"][1:]))
-    evals = read_csv(tmp_path / "eval.csv")
+    evals = read_csv(unbroken / "eval.csv")
     np.testing.assert_array_equal(evals["frame"], [2000, 4000])
     assert np.all(evals["expert_task_return_mean"] > 800)
     assert np.all(evals["wasserstein_to_expert"] > 0)
-    filmed = _filmed(tmp_path)
+    filmed = _filmed(unbroken)
     assert filmed["imitation_rewards"].shape == filmed["task_rewards"].shape == (100,)
     assert "plan" not in filmed
-    settings = json.loads((tmp_path / "config.json").read_text())
+    settings = json.loads((unbroken / "config.json").read_text())
     assert settings["config"]["method"] == "pdac"
     assert settings["versions"]["jax"]
     assert settings["renderer"]
-    assert (tmp_path / "learning_curve.png").stat().st_size > 5_000
-    assert list((tmp_path / "videos").glob("*.mp4"))
-    assert list((tmp_path / "tensorboard").iterdir())
+    assert (unbroken / "learning_curve.png").stat().st_size > 5_000
+    assert list((unbroken / "videos").glob("*.mp4"))
+    assert list((unbroken / "tensorboard").iterdir())
 
-    again = run("evaluate", f"--workdir={tmp_path}", "--num_episodes=2")
+    again = call("evaluate", f"--workdir={unbroken}", "--num_episodes=2")
     assert again.returncode == 0, again.stderr
     assert again.stdout.count("episode ") == 2
-    assert (tmp_path / "videos" / "evaluation.mp4").stat().st_size > 1_000
+    assert (unbroken / "videos" / "evaluation.mp4").stat().st_size > 1_000
 
-    policy = jaxil.load_policy(tmp_path)
+    policy = jaxil.load_policy(unbroken)
     rng = np.random.default_rng(0)
     seen = rng.integers(0, 256, (3, *policy.observation_shape), np.uint8)
-    export.main(["export", f"--workdir={tmp_path}", f"--output={tmp_path / 'policy'}"])
-    actions = _exported(tmp_path / "policy", seen)
+    export.main(["export", f"--workdir={unbroken}", f"--output={unbroken / 'policy'}"])
+    actions = _exported(unbroken / "policy", seen)
     assert actions.shape == (3, 2)
     np.testing.assert_allclose(actions, policy(seen), atol=1e-5)
     np.testing.assert_allclose(policy(seen[1]), actions[1], atol=1e-5)
@@ -62,76 +78,89 @@ def test_pdac_trains_shows_itself_and_is_evaluated_again(tmp_path):
         policy(seen / 255.0)
 
     # The same command again finds nothing left to do.
-    before = (tmp_path / "train.csv").read_text()
-    assert run("launch", *small_run("pdac", tmp_path)).returncode == 0
-    assert (tmp_path / "train.csv").read_text() == before
+    before = (unbroken / "train.csv").read_text()
+    assert call("launch", *small_run("pdac", unbroken), _REFRESH).returncode == 0
+    assert (unbroken / "train.csv").read_text() == before
 
 
-@pytest.mark.parametrize("method", ["psil", "sil", "dac", "drqv2", "zero"])
+def test_resumes_bit_for_bit_after_a_kill(unbroken, tmp_path):
+    process = _start(*small_run("pdac", tmp_path), _REFRESH)
+    # Killed with an episode begun after the first checkpoint.
+    _wait_for(lambda: list(tmp_path.glob("checkpoints/frame_000000002000*")), process)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert not (tmp_path / "checkpoints" / "frame_000000004000").exists()
+
+    resumed = call("launch", *small_run("pdac", tmp_path), _REFRESH)
+    assert resumed.returncode == 0, resumed.stderr
+    assert "resuming from the checkpoint of frame 2000" in resumed.stderr
+    expected, got = (read_csv(each / "train.csv") for each in (unbroken, tmp_path))
+    assert list(expected) == list(got)
+    for column in expected:
+        if column not in _CLOCKS:
+            np.testing.assert_array_equal(got[column], expected[column], column)
+    expected, got = (read_csv(each / "eval.csv") for each in (unbroken, tmp_path))
+    np.testing.assert_array_equal(got["task_return_mean"], expected["task_return_mean"])
+
+
+@pytest.mark.parametrize("method", ["psil", "sil", "dac"])
 def test_method_trains(method, tmp_path):
-    finished = run("launch", *small_run(method, tmp_path), "--config.total_frames=3000")
+    flags = (*small_run(method, tmp_path), "--config.total_frames=2000")
+    finished = call("launch", *flags)
     assert finished.returncode == 0, finished.stderr
     train = read_csv(tmp_path / "train.csv")
-    assert len(train["frame"]) == 3
-    if method in ("psil", "sil"):
+    assert len(train["frame"]) == 2
+    if method == "dac":
+        assert np.all(np.isfinite(train["discriminator/expert_logit"][1:]))
+    else:
         # The first episode is scaled to minus ten, and the scale then stays.
         assert train["imitation_return"][0] == pytest.approx(-10.0, rel=1e-4)
         assert len(set(train["sinkhorn/scale"])) == 1
         filmed = _filmed(tmp_path)
         assert filmed["plan"].shape == (101, 101)
         np.testing.assert_allclose(filmed["plan"].sum(axis=1), 1 / 101, rtol=1e-3)
-    elif method == "drqv2":
-        np.testing.assert_array_equal(train["imitation_return"], train["task_return"])
-    elif method == "dac":
-        assert np.all(np.isfinite(train["discriminator/expert_logit"][1:]))
-    else:
-        assert not train["imitation_return"].any()
 
 
 def test_cloning_learns_without_playing(tmp_path):
-    flags = [
+    finished = call(
+        "launch",
         *small_run("bc", tmp_path),
         "--config.total_frames=3000",
         "--config.update_every_steps=1",
         "--config.learning_rate=3e-3",
-    ]
-    finished = run("launch", *flags)
+    )
     assert finished.returncode == 0, finished.stderr
     train = read_csv(tmp_path / "train.csv")
     # Of an actor that does nothing, where the expert pushes with full force, at a
     # standard deviation of 0.1: 1 / (2 * 0.1^2) - 1.4, about 45 in the mean.
     assert train["actor/loss"][-1] < 10
     assert not np.any(np.isfinite(train["task_return"]))
-    evals = read_csv(tmp_path / "eval.csv")
-    np.testing.assert_array_equal(evals["frame"], [2000, 3000])
-    before = (tmp_path / "eval.csv").read_text()
-    again = run("launch", *flags)
-    assert again.returncode == 0
-    assert (tmp_path / "eval.csv").read_text() == before
-
-
-def _filmed(workdir):
-    newest = max((workdir / "videos").glob("*.npz"))
-    with np.load(newest) as arrays:
-        return dict(arrays)
+    np.testing.assert_array_equal(
+        read_csv(tmp_path / "eval.csv")["frame"], [2000, 3000]
+    )
 
 
 def test_state_expert_is_recorded_and_imitated(tmp_path):
     expert = tmp_path / "expert"
-    flags = (
+    trained = call(
+        "launch",
         "--config=configs/expert.py:cartpole_swingup",
         "--config.total_frames=1000",
         "--config.seed_frames=500",
         "--config.action_repeat=10",
+        "--config.hidden_dim=16",
         "--config.num_eval_episodes=1",
+        f"--workdir={expert}",
     )
-    assert run("launch", *flags, f"--workdir={expert}").returncode == 0
+    assert trained.returncode == 0, trained.stderr
+    train = read_csv(expert / "train.csv")
+    np.testing.assert_array_equal(train["imitation_return"], train["task_return"])
     output = tmp_path / "demonstrations.npz"
-    recorded = run(
+    recorded = call(
         "collect", f"--workdirs={expert}", f"--output={output}", "--num_episodes=2"
     )
     assert recorded.returncode == 0, recorded.stderr
-    imitated = run(
+    imitated = call(
         "launch",
         *small_run("pdac", tmp_path / "agent"),
         "--config.task=cartpole_swingup",
@@ -140,7 +169,7 @@ def test_state_expert_is_recorded_and_imitated(tmp_path):
     )
     assert imitated.returncode == 0, imitated.stderr
     output.unlink()
-    evaluated = run("evaluate", f"--workdir={tmp_path / 'agent'}", "--num_episodes=1")
+    evaluated = call("evaluate", f"--workdir={tmp_path / 'agent'}", "--num_episodes=1")
     assert evaluated.returncode == 0, evaluated.stderr
     assert f"without demonstrations: {output} cannot be read" in evaluated.stderr
     assert "the expert's" not in evaluated.stdout
@@ -160,75 +189,51 @@ def _exported(folder, observations):
     return np.load(folder / "actions.npy")
 
 
-def test_resumes_bit_for_bit_after_a_kill(tmp_path):
-    unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
-    # Rewards are refreshed at frames 2000 and 4000, before the kill and after it.
-    refresh = "--config.reward_refresh_steps=150"
-    assert run("launch", *small_run("pdac", unbroken), refresh).returncode == 0
-
-    process = subprocess.Popen(
-        arguments("launch", *small_run("pdac", broken), refresh),
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env={**os.environ, "JAX_PLATFORMS": "cpu"},
-    )
-    # Killed with an episode begun after the first checkpoint.
-    _wait_for(lambda: list(broken.glob("checkpoints/frame_000000002000*")), process)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert not (broken / "checkpoints" / "frame_000000004000").exists()
-
-    resumed = run("launch", *small_run("pdac", broken), refresh)
-    assert resumed.returncode == 0, resumed.stderr
-    assert "resuming from the checkpoint of frame 2000" in resumed.stderr
-    expected, got = (read_csv(folder / "train.csv") for folder in (unbroken, broken))
-    assert list(expected) == list(got)
-    for column in expected:
-        if column not in _CLOCKS:
-            np.testing.assert_array_equal(got[column], expected[column], column)
-    expected, got = (read_csv(folder / "eval.csv") for folder in (unbroken, broken))
-    np.testing.assert_array_equal(got["task_return_mean"], expected["task_return_mean"])
-
-
 def test_ctrl_c_saves_and_says_how_to_resume(tmp_path):
-    flags = (*small_run("zero", tmp_path), "--config.total_frames=1000000")
-    process = subprocess.Popen(
-        arguments("launch", *flags),
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "JAX_PLATFORMS": "cpu"},
-    )
+    flags = (*small_run("zero", tmp_path), *STATES, "--config.total_frames=1000000")
+    process = _start(*flags)
     rows = tmp_path / "train.csv"
     _wait_for(lambda: rows.exists() and rows.read_text().count("\n") > 2, process)
     process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=120)
+    output, _ = process.communicate(timeout=300)
     assert process.returncode == 130
-    assert "rerun the same command to resume" in stderr
-    assert "Traceback" not in stderr
+    assert "rerun the same command to resume" in output
+    assert "Traceback" not in output
     assert list((tmp_path / "checkpoints").glob("frame_*"))
 
 
 def test_a_run_outlives_the_pipe_that_it_writes_to(tmp_path):
     # As in `... 2>&1 | head -1`.
-    process = subprocess.Popen(
-        arguments("launch", *small_run("zero", tmp_path), "--config.total_frames=2000"),
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        env={**os.environ, "JAX_PLATFORMS": "cpu"},
-    )
+    flags = (*small_run("zero", tmp_path), *STATES, "--config.total_frames=2000")
+    process = _start(*flags)
     assert process.stdout is not None
     process.stdout.readline()
     process.stdout.close()
-    assert process.wait(timeout=200) == 0
+    assert process.wait(timeout=900) == 0
     np.testing.assert_array_equal(read_csv(tmp_path / "eval.csv")["frame"], [2000])
+    assert not read_csv(tmp_path / "train.csv")["imitation_return"].any()
     assert list((tmp_path / "checkpoints").glob("frame_000000002000"))
 
 
-def _wait_for(condition, process, seconds: float = 200.0) -> None:
+def _filmed(workdir):
+    newest = max((workdir / "videos").glob("*.npz"))
+    with np.load(newest) as arrays:
+        return dict(arrays)
+
+
+def _start(*flags: str) -> subprocess.Popen:
+    """Starts a run whose output, errors included, goes to one pipe."""
+    return subprocess.Popen(
+        arguments("launch", *flags),
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+    )
+
+
+def _wait_for(condition, process, seconds: float = 900.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert process.poll() is None, "the run ended too soon"

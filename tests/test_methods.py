@@ -5,8 +5,6 @@ import inspect
 import json
 import os
 import pathlib
-import subprocess
-import sys
 
 import pytest
 
@@ -14,6 +12,7 @@ from jaxil import config as jaxil_config
 from jaxil import methods
 from jaxil.errors import UsageError
 from tests.commands import ROOT, run, small_run
+from tests.processes import run_python
 from tests.reporting.run_folders import write_run
 
 _DECLARED = {
@@ -53,20 +52,6 @@ def make_rewarder(agent, *, weight):
 
     return Rewarder(rewards, summary=lambda state: {"brightness/weight": weight})
 '''
-
-
-def python(source: str) -> str:
-    """Runs a program in a process of its own; returns what it prints."""
-    finished = subprocess.run(
-        [sys.executable, "-c", source],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60.0,
-    )
-    assert finished.returncode == 0, finished.stderr
-    return finished.stdout
 
 
 # Our own -----------------------------------------------------------------------
@@ -117,7 +102,7 @@ def test_labels_ranks_and_colours_are_unique():
 
 
 def test_declarations_are_read_without_jax():
-    printed = python(
+    printed = run_python(
         "import sys\n"
         "from jaxil import config, methods\n"
         "[config.default_config(name) for name in methods.known()]\n"
@@ -149,7 +134,7 @@ def test_a_method_from_outside_trains(package, tmp_path):
         *small_run("zero", workdir),
         "--config.method=my_method:METHOD",
         "--config.brightness.weight=0.5",
-        "--config.total_frames=2000",
+        "--config.total_frames=1000",
     )
     assert finished.returncode == 0, finished.stderr
     header, first, *_ = (workdir / "train.csv").read_text().splitlines()
@@ -185,7 +170,7 @@ def test_installed_packages_name_methods_by_entry_points(package):
         # The second has a name that is taken: ours stays.
         "[jaxil.methods]\nbright = my_method:METHOD\npdac = my_method:METHOD\n"
     )
-    printed = python(
+    printed = run_python(
         "import sys\n"
         "from jaxil import config, methods\n"
         "bright = methods.known()['bright']\n"
@@ -241,7 +226,7 @@ def _was_sprung(package) -> bool:
 
 
 def test_reading_a_folder_imports_no_module_that_it_names(package, trap):
-    printed = python(
+    printed = run_python(
         "import pathlib\n"
         "from jaxil.errors import UsageError\n"
         "from jaxil.reporting import runs\n"
@@ -285,7 +270,7 @@ def test_a_broken_installed_method_is_named_and_the_others_work(package):
         "broken = broken:METHOD\n"
         "bright = my_method:METHOD\n"
     )
-    printed = python(
+    printed = run_python(
         "import contextlib, io\n"
         "from jaxil import methods\n"
         "from jaxil.errors import UsageError\n"

@@ -16,7 +16,7 @@ import pytest
 from jaxil.files.tables import read_csv
 from jaxil.sweeps import clusters, state
 from jaxil.sweeps.state import State
-from tests.commands import ROOT, SMALL
+from tests.commands import ROOT, SMALL, STATES
 from tests.trainer import FRAMES, stand_in
 
 _DAEMONS = ("slurmctld", "slurmd")
@@ -159,8 +159,7 @@ def test_a_sweep_of_real_runs_survives_a_requeue(tmp_path):
         *(sys.executable, "launch/sweep.py", "--cluster=slurm", "--gpus=0", "--cpus=1"),
         *("--methods=drqv2", "--preset=tiny", "--tasks=ball_in_cup_catch"),
         *("--seeds=1", f"--workdir={tmp_path}", *SMALL),
-        *("--config.observation=state", "--config.encoder.subtract_mean_image=False"),
-        "--config.total_frames=20000",
+        *(*STATES, "--config.total_frames=20000"),
     ]
     sweep = _run(arguments)
     assert "1 submitted" in sweep

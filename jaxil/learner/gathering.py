@@ -30,7 +30,7 @@ class Frames(NamedTuple):
 
 
 def gather_batch(frames: Data, batch: Batch) -> Batch:
-    """Replaces the frame indices of a batch from `Replay.sample_indices` by stacks."""
+    """Replaces the frame indices of a batch from `Replay.sample` by stacks."""
     return batch.map_observations(functools.partial(gather_stacks, frames))
 
 
@@ -43,12 +43,7 @@ def gather_expert(frames: Data, expert: ExpertBatch) -> ExpertBatch:
     """
     chex.assert_rank(frames, {3, 5})
     flat = jnp.asarray(frames).reshape(-1, *frames.shape[2:])
-    successor = expert.successor
-    if successor is not None:
-        successor = gather_stacks(flat, successor)
-    return expert._replace(
-        observation=gather_stacks(flat, expert.observation), successor=successor
-    )
+    return expert.map_observations(functools.partial(gather_stacks, flat))
 
 
 def make_gathering_step(step: Step) -> Step:

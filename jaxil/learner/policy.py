@@ -1,4 +1,4 @@
-"""From observations to actions."""
+"""Policies: functions from observations to actions."""
 
 from collections.abc import Callable
 
@@ -19,7 +19,7 @@ MeanAction = Callable[[Params, Params, Data], Array]
 def make_sample_action(
     networks: AgentNetworks, exploration_std: optax.Schedule
 ) -> SampleAction:
-    """Returns the policy that gathers experience.
+    """Returns the policy that collects experience.
 
     (encoder params, actor params, observations [E, H, W, C], key, num_steps [E]) ->
     actions [E, A]. `num_steps` counts agent steps: it sets the noise's size and, with

@@ -23,7 +23,7 @@ RewarderState = Any  # a pytree, the method's own
 
 
 class AgentSpec(NamedTuple):
-    """What a method may know of the agent when it is made.
+    """What a method is told of the agent when it is created.
 
     Attributes:
       networks: the agent's.
@@ -39,7 +39,7 @@ class AgentSpec(NamedTuple):
 
 
 class AgentView(NamedTuple):
-    """The agent's samples, as its own update has computed them before it steps.
+    """The agent's samples, as its update computed them before its step.
 
     Attributes:
       observation: augmented pixels. Shape [B, H, W, C].
@@ -129,7 +129,7 @@ class Rewarder(NamedTuple):
         loss and differentiated for `learner.actor`; the other networks of `learner`
         have made this update's step. None without.
       plan: (state, learner, episode, expert_episodes) -> the transport plan
-        [T + 1, N + 1] behind `rewards`, to look at; None without one.
+        [T + 1, N + 1] behind `rewards`, for reports; None without one.
       summary: state -> scalars worth logging after an episode.
     """
 

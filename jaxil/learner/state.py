@@ -1,4 +1,4 @@
-"""Learner state: everything that training changes, and nothing else."""
+"""The learner's state: everything that training changes."""
 
 from typing import Any, NamedTuple
 
@@ -45,8 +45,8 @@ class TrainState(struct.PyTreeNode):
       target_critic: slow copy of the critic's parameters.
       rewarder: what the imitation method learns or remembers.
       key: base random key. Never consumed: update number n uses
-        `fold_in(key, n)`, so a resumed run repeats the draws of an unbroken one.
-      num_updates: gradient steps done so far. Shape [], int32.
+        `fold_in(key, n)`, so a resumed run has the random numbers of an unbroken one.
+      num_updates: gradient steps so far. Shape [], int32.
     """
 
     encoder: ModuleState
@@ -78,7 +78,7 @@ def apply_gradients(
 
 
 def copy_params(params: Params) -> Params:
-    """Returns the same values in buffers of their own.
+    """Returns a copy in separate buffers.
 
     Two trees that share buffers cannot both be donated to one call.
     """

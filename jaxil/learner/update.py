@@ -28,7 +28,7 @@ UpdateStep = Callable[
 
 @dataclasses.dataclass(frozen=True)
 class Learner:
-    """What training does not change; constant to the compiler.
+    """What training does not change; the compiler sees constants.
 
     Attributes:
       networks: encoder, actor and critic.
@@ -68,7 +68,7 @@ def init_train_state(
       spec: sizes.
     """
     networks = learner.networks
-    # Beyond all update numbers, so no random number is used twice.
+    # Larger than all update numbers, so no random number is used twice.
     encoder_key, actor_key, critic_key, rewarder_key = jax.random.split(
         jax.random.fold_in(key, 2**32 - 1), 4
     )
@@ -158,7 +158,7 @@ def _with_successors(
 ) -> AgentView:
     """Adds augmented successors, and their features without gradient."""
     assert batch.successor is not None
-    # A key of its own, so that the other random numbers stay as they are without.
+    # A separate key, so that no other random number depends on successors.
     successor = _augment(learner, batch.successor, jax.random.fold_in(key, 1))
     features = critic_features(
         learner.networks, before.encoder, before.critic, successor

@@ -7,7 +7,7 @@ from typing import Any
 from jaxil.machine import devices
 
 _PACKAGES = (
-    *("jaxil", "jax", "jaxlib", "flax", "optax", "ott-jax"),
+    *("jaxil", "jax", "jaxlib", "flax", "optax"),
     *("mujoco", "dm-control", "numpy"),
 )
 

@@ -81,6 +81,14 @@ class ExpertBatch(NamedTuple):
     action: Data
     successor: Data | None = None
 
+    def map_observations(self, function: Callable[[Data], Data]) -> "ExpertBatch":
+        """Returns a batch with the function's results instead of all observations."""
+        successor = self.successor
+        return self._replace(
+            observation=function(self.observation),
+            successor=None if successor is None else function(successor),
+        )
+
 
 class Episode(NamedTuple):
     """One finished episode, frames not stacked.

@@ -73,6 +73,7 @@ class Replay(EpisodeRing):
         *,
         windows: bool = False,
         successors: bool = False,
+        as_indices: bool = False,
     ) -> Batch:
         """Samples transitions, uniformly with replacement from all windows of n steps.
 
@@ -85,28 +86,12 @@ class Replay(EpisodeRing):
           batch_size: B >= 1.
           windows: whether to add all transitions of each window.
           successors: whether to add o_{t+1}.
+          as_indices: whether observations are the int32 [B, stack] indices of their
+            frames in `frames`, oldest first, instead of pixels. They are valid until
+            the next episode is added.
 
         Raises:
           ValueError: if no stored episode is as long as a window.
-        """
-        batch = self.sample_indices(
-            rng, batch_size, windows=windows, successors=successors
-        )
-        return batch.map_observations(lambda each: gather_stacks(self._frames, each))
-
-    def sample_indices(
-        self,
-        rng: np.random.Generator,
-        batch_size: int,
-        *,
-        windows: bool = False,
-        successors: bool = False,
-    ) -> Batch:
-        """Samples like `sample`, with frame indices instead of pixels.
-
-        Returns:
-          A batch whose observations are the int32 [stack] indices of their frames in
-          `frames`, oldest first. They are valid until the next episode is added.
         """
         num_windows = self._num_windows()
         if not num_windows.any():
@@ -137,7 +122,7 @@ class Replay(EpisodeRing):
                 action=self._actions[slots],
                 weight=weights.astype(np.float32),
             )
-        return Batch(
+        batch = Batch(
             observation=self._stack_slots(starts, steps),
             action=self._actions[slots[:, 0]],
             reward=(weights * rewards).sum(axis=1).astype(np.float32),
@@ -146,6 +131,9 @@ class Replay(EpisodeRing):
             successor=self._stack_slots(starts, steps + 1) if successors else None,
             window=window,
         )
+        if as_indices:
+            return batch
+        return batch.map_observations(lambda each: gather_stacks(self._frames, each))
 
     def _num_windows(self) -> np.ndarray:
         """Returns how many windows each stored episode has, [episodes]."""

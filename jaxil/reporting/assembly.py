@@ -23,9 +23,9 @@ def write_report(
 
     Args:
       runs: at least one.
-      output: where; an older report there is replaced as a whole.
+      output: new folder; an older report there is replaced.
       unreadable: sentences about runs that cannot be read.
-      num_seeds: how many seeds each variant should have; None if nobody asked.
+      num_seeds: how many seeds each variant should have; None if unknown.
       num_videos: how many of each variant to show.
 
     Raises:

@@ -98,7 +98,7 @@ def _video(path: pathlib.Path, room: int) -> bytes:
 
     Raises:
       OSError: it cannot be read.
-      ValueError: says what else is wrong with it.
+      ValueError: it is too large or no MP4.
     """
     with untrusted.open_regular(path) as file:
         video = file.read(_MAX_BYTES_EACH + 1)

@@ -1,4 +1,4 @@
-"""The folder of a report: written aside, then moved into its place as a whole."""
+"""The folder of a report: written under another name, then renamed."""
 
 import contextlib
 import os
@@ -39,9 +39,9 @@ def problems(output: pathlib.Path) -> list[str]:
 
 @contextlib.contextmanager
 def replaced(output: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Gives a new folder, and moves it to `output` at the end.
+    """Yields a new folder, and renames it to `output` at the end.
 
-    After an exception `output` is as it was; a kill may leave hidden folders beside it.
+    An exception leaves `output` unchanged; a kill may leave hidden folders beside it.
 
     Raises:
       OSError: it cannot be written.

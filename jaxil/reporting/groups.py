@@ -1,4 +1,4 @@
-"""Which runs are seeds of one thing, its name, and its look in every figure."""
+"""Groups of seeds with equal settings: their labels and their look in figures."""
 
 import colorsys
 import re
@@ -134,7 +134,7 @@ def changes(run: Run) -> dict[str, Any]:
 
 
 def short(value: Any) -> str:
-    """Returns a setting's value for people, such as "5M" or "(1, 2)"."""
+    """Returns a setting's value in short, such as "5M" or "(1, 2)"."""
     if isinstance(value, int) and not isinstance(value, bool):
         if value and value % 1000 == 0:
             return f"{value // 1000}k" if value % 1_000_000 else f"{value // 10**6}M"
@@ -185,7 +185,7 @@ def tasks_of(groups: Iterable[Group]) -> dict[str, list[Group]]:
 
 def _matters(run: Run, field: str) -> bool:
     variations = figures.declaration(run.variant.method).variations
-    # The label, or the panel, says these already.
+    # The label or the panel already shows these.
     named = ("method", "task", figures.DEMONSTRATIONS, *(v.field for v in variations))
     return field not in (*jaxil_config.FREE_FIELDS, "seed", *named)
 
@@ -208,7 +208,7 @@ def _labels(keys: Iterable[tuple[str, str, tuple[str, ...]]]) -> dict[tuple, str
 
 
 def _looks(coloured: Iterable[tuple[str, str]]) -> dict[str, Look]:
-    """Returns the look of each label, from pairs of its method's colour and it."""
+    """Returns the look of each label, from pairs (colour of its method, label)."""
     looks: dict[str, Look] = {}
     counts: Counter[str] = Counter()
     for colour, label in coloured:

@@ -1,4 +1,4 @@
-"""What is measured of a group: curves, last returns, and how soon it was good."""
+"""Metrics of a group: curves, last returns, and sample efficiency."""
 
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ class Curve(NamedTuple):
       group: whose.
       x: frames or hours, rising. Shape [X].
       mean: with Student's interval, NaN where one seed is left. Shapes [X].
-      count: how many seeds have been there. Shape [X].
+      count: how many seeds have a value there. Shape [X].
       num_runs: how many seeds have any of it.
     """
 
@@ -88,10 +88,10 @@ def final(group: Group) -> Final | None:
 
 
 def arrivals(run: Run, x: str) -> list[float]:
-    """Returns when a run reached each of LEVELS of its expert; NaN for never.
+    """Returns when a run first reached each of LEVELS of its expert; NaN for never.
 
     Args:
-      run: any; one without an expert of its own reaches none.
+      run: any; a run without demonstrations reaches none.
       x: "frame" or "hours".
     """
     position, returns = series(run.evaluation, x, "task_return_mean")

@@ -1,4 +1,4 @@
-"""The paper's figures: what there is, what is missing, and the command for it."""
+"""The paper's figures: finished and missing runs, and the command for those."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ class PaperFigure(NamedTuple):
 
     Attributes:
       figure: which.
-      sheet: the plots; None where no runs show what it is about.
+      sheet: the plots; None without suitable runs.
       num_finished: finished seeds of all tasks and variants, none beyond those wanted.
       num_wanted: how many there should be.
       command: trains what is missing; empty if nothing is.
@@ -52,7 +52,7 @@ def _figure(groups: list[Group], figure: Figure, num_seeds: int) -> PaperFigure:
         f"jaxil sweep --ablation=figure{figure.number} "
         f"--tasks={','.join(missing)} --seeds={num_seeds} --workdir=DIR"
     )
-    # An ablation of which only the plain method has run shows nothing.
+    # An ablation needs more than the plain method.
     shows = not figure.is_ablation or any(group.variant.overrides for group in own)
     return PaperFigure(
         figure,

@@ -1,4 +1,4 @@
-"""What a reader should know beside the figures: what is odd, or cannot be compared."""
+"""Warnings for the reader: unusual runs, and what limits comparisons."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -13,7 +13,7 @@ from jaxil.reporting.groups import (
 
 
 def remarks(groups: Sequence[Group]) -> list[str]:
-    """Returns one sentence for each thing that a reader should know."""
+    """Returns the warnings, one sentence each."""
     return [*_about_runs(groups), *_about_groups(groups), *_about_tasks(groups)]
 
 

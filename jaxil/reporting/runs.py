@@ -1,4 +1,4 @@
-"""Finding runs and reading what they wrote, however little or damaged that is."""
+"""Finds runs and reads their files, which may be incomplete or damaged."""
 
 import functools
 import json
@@ -44,7 +44,7 @@ class Run(NamedTuple):
       evaluation: eval.csv by column, rising frames, finite returns. Shapes [E].
       training: train.csv by column, rising frames. Shapes [R].
       device: what it computed on.
-      remarks: what is missing or odd, one sentence each.
+      remarks: warnings, one sentence each.
     """
 
     folder: pathlib.Path
@@ -223,7 +223,7 @@ def _setting(nested: Mapping[str, Any], field: str, default: Any) -> Any:
     value: Any = nested
     for part in field.split("."):
         if not isinstance(value, Mapping):
-            raise UnreadableError(f"{field} must lie in a group of settings")
+            raise UnreadableError(f"{field} must be in a group of settings")
         if part not in value:
             return default  # an older jaxil wrote the file
         value = value[part]

@@ -29,7 +29,7 @@ _SETTINGS: dict[Any, Any] = {
     "axes.labelcolor": INK,
     "axes.linewidth": 0.7,
     "text.color": INK,
-    "text.parse_math": False,  # a "$" in a name is no formula
+    "text.parse_math": False,  # so that "$" in a name is plain text
     "xtick.color": INK,
     "ytick.color": INK,
     "hatch.linewidth": 0.8,
@@ -60,7 +60,7 @@ class Sheet(NamedTuple):
       name: of its files.
       panels: at least one.
       legend: labels with their looks; empty where panels say it themselves.
-      caption: what one sees, in a sentence or two.
+      caption: a sentence or two.
     """
 
     name: str
@@ -83,7 +83,7 @@ def inline_svg(panel: Panel, prefix: str) -> str:
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     head, _, rest = text.partition(">")
-    # Its size is the page's affair; the viewBox keeps the proportions.
+    # The page sets the size; the viewBox keeps the proportions.
     head = re.sub(r' (width|height)="[^"]*"', "", head)
     text = f'{head} role="img">{rest}'
     text = re.sub(r'\bid="', f'id="{prefix}-', text)
@@ -115,7 +115,7 @@ def _figure(
     title: float,
 ) -> tuple[Any, list[Any]]:
     """Returns a figure with axes for each panel, and its legend."""
-    # Not pyplot: a Figure of one's own needs no display and leaves no global state.
+    # Not pyplot: a separate Figure needs no display and leaves no global state.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D

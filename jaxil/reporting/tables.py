@@ -1,4 +1,4 @@
-"""The report's tables: rows of cells, as exact CSV and as text for people."""
+"""The report's tables, as CSV with every digit and as text on the page."""
 
 import csv
 import io
@@ -85,7 +85,7 @@ def is_number(column: str) -> bool:
 
 
 def shown(table: Table, column: str, cell: Any) -> str:
-    """Returns a cell as people read it."""
+    """Returns a cell as text on the page."""
     if _is_missing(cell):
         return "–"
     kind = _FORMATS.get(column, "")
@@ -171,7 +171,7 @@ def aggregate_table(finals: Sequence[Final]) -> Table:
 
 
 def efficiency_table(groups: Sequence[Group]) -> Table:
-    """Returns how soon each group was as good as shares of its expert."""
+    """Returns when each group reached shares of its expert's return."""
     rows = []
     for group in groups:
         runs = group.measured
@@ -202,7 +202,7 @@ def seed_table(groups: Sequence[Group], num_seeds: int | None) -> Table:
 
     Args:
       groups: of all runs.
-      num_seeds: lists which of seeds 0 to num_seeds - 1 are missing; None: asks none.
+      num_seeds: lists which of seeds 0 to num_seeds - 1 are missing; None: does not.
     """
     rows = []
     for group in groups:

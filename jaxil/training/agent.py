@@ -30,7 +30,7 @@ from jaxil.networks.agent import AgentNetworks, make_agent_networks
 
 
 class Agent(NamedTuple):
-    """The compiled functions of a run, and what they start from.
+    """The compiled functions of a run, and its first state.
 
     Attributes:
       update_step: (state, batch, expert batch, frames=None) -> (state, metrics);
@@ -99,21 +99,21 @@ def make_networks(config: Config, action_dim: int, mean: Any) -> AgentNetworks:
 
 
 def uses_native_convolutions(config: Config) -> bool:
-    """Returns whether the encoder's convolutions are our own, and loads them if so."""
+    """Returns whether the encoder uses the convolutions in C, and loads them if so."""
     wanted = config.encoder.convolutions != "xla" and native_fault(config) is None
     return wanted and build.problem() is None
 
 
 def native_fault(config: Config) -> str | None:
-    """Returns why our own convolutions are not for a config."""
+    """Returns why a config cannot use the convolutions in C; None if it can."""
     if config.observation != "pixels":
-        return f"they are for pixels, not observation={config.observation!r}"
+        return f"they need pixels, not observation={config.observation!r}"
     if config.compute_dtype != "float32":
-        return f"they are for float32, not compute_dtype={config.compute_dtype!r}"
+        return f"they need float32, not compute_dtype={config.compute_dtype!r}"
     channels = tuple(config.encoder.channels)
     if any(each % encoding.FEATURES for each in channels):
         return (
-            f"they make multiples of {encoding.FEATURES} channels, not "
+            f"they need multiples of {encoding.FEATURES} channels, not "
             f"encoder.channels={channels}"
         )
     if len(channels) > encoding.MOST_LAYERS:

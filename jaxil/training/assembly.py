@@ -26,7 +26,7 @@ from jaxil.training.agent import native_fault, stack_size
 
 # Added to the seed for what must not share its random starts with training.
 _EVALUATION_SEED = 1_000_003
-# A fault in one of these leaves no sense in opening the demonstrations.
+# With a fault in one of these, the demonstrations are not opened.
 _READING_FIELDS = {
     "method",
     "task",
@@ -68,7 +68,7 @@ def problems(config: Config) -> list[Fault]:
 
 
 def demonstration_fault(config: Config) -> str | None:
-    """Returns why the config's demonstrations can't serve it; None if they can."""
+    """Returns why a run cannot use its demonstrations; None if it can."""
     try:
         loading.check(
             config.demonstrations.source,
@@ -104,7 +104,7 @@ def training_environment(config: Config) -> PixelEnvironment:
 
 
 def evaluation_environment(config: Config) -> PixelEnvironment:
-    """Returns an environment of its own, with starts of its own."""
+    """Returns a separate environment, with starts that training does not use."""
     return environment_with_seed(config, config.seed + _EVALUATION_SEED)
 
 
@@ -127,28 +127,23 @@ def make_player(
     Args:
       config: checked.
       environment: the training environment; several are made like it.
-      first_episode: see `Player`.
-      open_episodes: see `Player`.
+      first_episode: see `Player`, as for `open_episodes`.
       timed: wraps the environments, to measure their time.
-      say: takes a line for people.
+      say: prints a line.
     """
     if not methods.get(config.method).plays:
         return None
     environments: Any = InProcess(environment)
     if config.num_environments > 1:
-        # All have one seed: an episode's number alone fixes its start. The child finds
-        # what this names without jax, which would take memory and seconds.
+        # All have one seed: an episode's number alone determines its start. The child
+        # imports this without jax, which would take memory and seconds.
         make = functools.partial(
             make_environment,
             config.task,
             seed=config.seed,
             **_environment_settings(config),
         )
-        environments = Pool(
-            make,
-            config.num_environments,
-            say=say,
-        )
+        environments = Pool(make, config.num_environments, say=say)
     return Player(
         timed(environments), first_episode=first_episode, open_episodes=open_episodes
     )
@@ -167,10 +162,8 @@ def _environment_settings(config: Config) -> dict[str, Any]:
     }
 
 
-def load_demonstrations(
-    config: Config,
-) -> loading.Demonstrations | None:
-    """Returns the demonstrations of a run, rendered as the agent sees; or None.
+def load_demonstrations(config: Config) -> loading.Demonstrations | None:
+    """Returns a run's demonstrations, rendered as the agent sees them; or None.
 
     Rendering them takes minutes at quality `paper` in software, the first time: a
     progress line is shown.

@@ -4,12 +4,12 @@
     DIR/replay/episode_00000012.npz       written once, never changed
 
 Episode files are written first, then the checkpoint is renamed into place, and old ones
-are deleted last. So at any kill the newest checkpoint in place is whole, and so are all
-the episodes that it needs.
+are deleted last. So whenever the process is killed, the newest checkpoint is complete,
+and so are all episodes that it needs.
 
-orbax's CheckpointManager is not used: it has no place for checksums, without which a
-changed array is restored silently, renames nothing else into place together with the
-arrays, and deletes a checkpoint of the same frame before it writes the new one.
+This does not use orbax's CheckpointManager: it stores no checksums, without which a
+changed array is restored silently; it renames nothing else into place together with the
+arrays; and it deletes a checkpoint of the same frame before it writes the new one.
 """
 
 import functools
@@ -54,7 +54,7 @@ class Checkpoints:
 
         Args:
           workdir: the run's folder.
-          say: takes a line for people, e.g. on a damaged checkpoint.
+          say: prints a line, for example on a damaged checkpoint.
         """
         # orbax wants absolute paths.
         self._workdir = pathlib.Path(workdir).absolute()
@@ -150,12 +150,12 @@ class Checkpoints:
     ) -> tuple[Any, dict]:
         """Reads the newest checkpoint, or the one before it if that is damaged.
 
-        Damaged episodes are left out of the replay, and named.
+        Damaged episodes are left out of the replay and reported.
 
         Args:
           abstract_learner_state: pytree of the same structure; its leaves (arrays, or
             what jax.eval_shape returns) say shapes, dtypes and types.
-          replay: it is emptied and filled with the episodes that were stored then.
+          replay: emptied, then filled with the checkpoint's episodes.
 
         Returns:
           The learner state, on jax's default device, and the counters.
@@ -239,8 +239,8 @@ class Checkpoints:
                 f"({'; '.join(faults[:3])}{more}): what follows differs from an "
                 "unbroken run"
             )
-        # Those in the files have to do for checkpoints of earlier versions: first
-        # without this file, then without the number of steps of a lost episode.
+        # Checkpoints of earlier versions lack this file, or the number of steps of a
+        # lost episode: the rewards in the episodes' files are used then.
         if not rewards.exists() or (faults and "episode_steps" not in record):
             return
         stored = replay.episodes

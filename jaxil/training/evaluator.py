@@ -1,4 +1,4 @@
-"""Evaluations of a run: episodes of the mean action, and how the method sees them."""
+"""Evaluations of a run: episodes of the mean action, with their imitation rewards."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.learner.state import TrainState
 from jaxil.maths.types import Episode, ExpertEpisodes
 from jaxil.training.agent import Agent
-from jaxil.training.expert_distance import Closeness
+from jaxil.training.expert_distance import ExpertDistance
 
 
 class Result(NamedTuple):
@@ -37,7 +37,7 @@ class Evaluator:
         agent: Agent,
         environment: PixelEnvironment,
         experts: ExpertEpisodes | None,
-        distance: Closeness | None,
+        distance: ExpertDistance | None,
     ) -> None:
         """See `parts.make_parts`."""
         self._config = config
@@ -93,11 +93,11 @@ class Evaluator:
         return Result(evaluation, distance, filmed)
 
     def explain(self, state: TrainState, episode: Episode) -> dict[str, np.ndarray]:
-        """Returns what the method makes of an episode, to look at.
+        """Returns an episode's rewards and transport plan, for videos and reports.
 
         Returns:
           `task_rewards` [T], `imitation_rewards` [T], and the transport plan
-          `plan` [T + 1, N + 1] of methods that have one.
+          `plan` [T + 1, N + 1] if the method has one.
         """
         arguments = (state.rewarder, state.params, episode, self._experts)
         found = {

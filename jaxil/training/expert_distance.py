@@ -1,4 +1,4 @@
-"""The paper's second measure: how far an agent's episodes are from the expert's."""
+"""The paper's second metric: the distance of an agent's episodes to the expert's."""
 
 import json
 import math
@@ -36,20 +36,20 @@ _FEATURE_DIM, _STATE_DIM = 50, 256
 # the cost matrix is [640, 640] at most.
 _MOMENTS, _MAX_EPISODES = 64, 10
 _LAYERS = ((3, 2), (3, 1), (3, 1), (3, 1))  # kernel and stride, as DrQ-v2's
-# Stored with a random policy's distance: one by another definition is not used.
+# Stored with a random policy's distance, which is not reused if this has changed.
 _DEFINITION = "debiased Sinkhorn divergence of 64 moments an episode"
 
 
-class Closeness:
+class ExpertDistance:
     """Measures the distance to the expert, relative to a random policy's.
 
         S(moments of an evaluation, moments of the demonstrations)
           / S(moments of uniformly random actions, moments of the demonstrations)
 
     with S the debiased Sinkhorn divergence between all moments of the episodes of
-    either side, seen by one random encoder that is never trained. So a random policy
-    has 1, and the demonstrations themselves have 0; other episodes of the expert come
-    near 0, as far as their number and their starts allow.
+    either side, embedded by one random encoder that is never trained. So a random
+    policy has distance 1 and the demonstrations themselves have 0; other episodes of
+    the expert come close to 0, limited by their number and their starts.
 
     Source: Cohen et al. 2021, sec. 4.1 and fig. 4, which give neither encoder nor
     entropy nor number of moments. The debiasing is ours: without it, the distance of
@@ -63,12 +63,9 @@ class Closeness:
         workdir: pathlib.Path,
         demonstrations: loading.Demonstrations,
     ) -> None:
-        """Embeds the demonstrations; the random policy is played at the first use.
+        """Embeds the demonstrations; the first use plays the random policy.
 
-        Args:
-          config: of the run.
-          workdir: its folder, where the random policy's distance is kept.
-          demonstrations: what the run imitates.
+        The random policy's distance is stored in `workdir`, the run's folder.
         """
         self._config = config
         self._path = workdir / "random_policy.json"

@@ -84,7 +84,7 @@ def read(folder: pathlib.Path) -> tuple[dict, dict[str, np.ndarray]]:
     """Reads the record and the learner's arrays by name, those of keys as numbers.
 
     Raises:
-      ValueError: a file is missing, or not as it was written.
+      ValueError: a file is missing or has changed.
     """
     import orbax.checkpoint as ocp
 
@@ -94,7 +94,7 @@ def read(folder: pathlib.Path) -> tuple[dict, dict[str, np.ndarray]]:
         # that were not there then, such as a file manager's, do not matter.
         expected = json.loads(read_regular(folder / _CHECKSUMS))
         if not expected or _checksums(folder, expected) != expected:
-            raise ValueError("its files are not as they were written")
+            raise ValueError("its files have changed since they were written")
         with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
             restored = checkpointer.restore(
                 folder,
@@ -106,7 +106,7 @@ def read(folder: pathlib.Path) -> tuple[dict, dict[str, np.ndarray]]:
         for name, leaf in restored.record["leaves"].items():
             array = np.asarray(restored.learner.get(name, ()), leaf["dtype"])
             arrays[name] = array.reshape(leaf["shape"])
-    except Exception as error:  # orbax and tensorstore raise whatever they meet
+    except Exception as error:  # orbax and tensorstore raise many kinds
         raise ValueError(_one_line(error)) from error
     return restored.record, arrays
 

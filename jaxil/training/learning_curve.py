@@ -1,4 +1,4 @@
-"""The picture of a run: task return over environment frames."""
+"""Plots a run's task return over environment frames."""
 
 import io
 import os
@@ -21,9 +21,9 @@ def plot(
     """Plots the evaluations of a run, as a PNG.
 
     Args:
-      path: the picture, replaced as a whole.
+      path: of the plot, replaced atomically.
       eval_csv: table with frame, task_return_mean and task_return_std.
-      title: what ran, e.g. the method and the task.
+      title: such as the method and the task.
       expert_return: mean task return of the demonstrations, a dashed line.
 
     Raises:

@@ -20,7 +20,7 @@ from jaxil.training import assembly
 from jaxil.training.agent import Agent
 from jaxil.training.checkpoint import Checkpoints
 from jaxil.training.evaluator import Evaluator
-from jaxil.training.expert_distance import Closeness
+from jaxil.training.expert_distance import ExpertDistance
 from jaxil.training.run_log import Outputs
 from jaxil.training.stopwatch import Stopwatch, TimedPool
 from jaxil.training.updates import Updates
@@ -102,7 +102,7 @@ def make_parts(
       config: checked.
       workdir: the run's folder.
       demonstrations: what the method imitates, or None.
-      say: takes a line for people.
+      say: prints a line.
     """
     environment = assembly.training_environment(config)
     agent = agents.make_agent(config, environment, demonstrations)
@@ -126,7 +126,7 @@ def make_parts(
     experts = agents.expert_episodes(agent.rewarder, demonstrations)
     distance = None
     if demonstrations is not None:
-        distance = Closeness(config, workdir, demonstrations)
+        distance = ExpertDistance(config, workdir, demonstrations)
     return dict(  # noqa: C408
         config=config,
         agent=agent,

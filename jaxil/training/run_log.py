@@ -1,4 +1,4 @@
-"""What a run shows of itself: tables, events, learning curve, videos."""
+"""What a run writes for its user: tables, events, learning curve, videos."""
 
 import io
 import math
@@ -24,7 +24,7 @@ TRAIN_COLUMNS = (
     "frame",  # environment frames when the episode ended
     "seconds",  # of the run, earlier processes included
     "episode",
-    "task_return",  # undiscounted sum of the true rewards, which the agent never sees
+    "task_return",  # undiscounted sum of task rewards, which the agent never sees
     "imitation_return",  # the same of the rewards that it learns from
     "length",  # agent steps
     "frames_per_second",
@@ -112,7 +112,7 @@ class Outputs:
         reward_seconds: float,
         metrics: dict[str, float],
     ) -> None:
-        """Writes one training episode down."""
+        """Logs a training episode."""
         last_frame, last_seconds = self._last
         speed = (frame - last_frame) / max(seconds - last_seconds, 1e-9)
         self._last = (frame, seconds)
@@ -131,7 +131,7 @@ class Outputs:
         )
 
     def updates(self, *, frame: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Writes down the progress of a method that plays no episodes."""
+        """Logs the progress of a method that plays no episodes."""
         self._write_training(frame, seconds, 0, metrics)
 
     def evaluation(
@@ -145,7 +145,7 @@ class Outputs:
         distance: float | None,
         filmed: dict[str, np.ndarray],
     ) -> str:
-        """Writes one evaluation down, with picture and video.
+        """Logs an evaluation, with learning curve and video.
 
         Args:
           evaluation: what was played.
@@ -157,7 +157,7 @@ class Outputs:
           filmed: arrays to keep beside the video, see `Evaluator.explain`.
 
         Returns:
-          One line for people.
+          A line for the terminal.
         """
         row: dict[str, Any] = {
             "frame": frame,
@@ -235,8 +235,8 @@ class _Events:
 
         messages: Any = event_pb2  # whose classes are made at run time
         folder.mkdir(exist_ok=True)
-        # Not its SummaryWriter, whose thread dies of a full disk, and with it the
-        # program: it then waits for the thread without end.
+        # Not its SummaryWriter: on a full disk its thread dies, and the program then
+        # waits for it forever.
         self._writer = event_file_writer.EventsWriter(str(folder / "events"))
         self._event = messages.Event
         if resume_frame is not None:

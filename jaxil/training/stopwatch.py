@@ -1,4 +1,4 @@
-"""Where a run's time goes."""
+"""Measures what a run spends its time on."""
 
 import time
 from collections.abc import Callable
@@ -6,7 +6,7 @@ from typing import Any
 
 
 class Stopwatch:
-    """Adds up the seconds of a run by what they are spent on."""
+    """Sums the seconds of a run by activity."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {"environment": 0.0, "update": 0.0}
@@ -26,7 +26,7 @@ class Stopwatch:
 
 
 class TimedPool:
-    """A pool; the time that one waits for its processes counts as "environment"."""
+    """A pool whose calls, waiting included, count as "environment"."""
 
     def __init__(self, pool: Any, stopwatch: Stopwatch) -> None:
         self.size = pool.size

@@ -1,4 +1,4 @@
-"""A policy that a run has learned, taken from its newest checkpoint."""
+"""The policy in a run's newest checkpoint."""
 
 import os
 import pathlib
@@ -83,7 +83,7 @@ class Policy:
         return assembly.environment_with_seed(self.config, seed)
 
     def description(self) -> str:
-        """Returns a few words on the training."""
+        """Returns a short description of the training."""
         config = self.config
         return (
             f"{config.method} learner on {config.observation}, seed {config.seed}, "

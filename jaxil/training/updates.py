@@ -1,4 +1,4 @@
-"""The learner's updates: batches sampled, collected, sent to the device, run."""
+"""Samples batches and runs the learner's updates, several in one call."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from jaxil.training.agent import Agent, stack_size
 
 Sampled = tuple[Batch | None, ExpertBatch | None]
 
-_REFRESH_EPISODES = 8  # in one call; bounds what leaves the host's memory at once
+_REFRESH_EPISODES = 8  # in one call; bounds the memory on the device
 
 
 class Updates:
@@ -34,12 +34,12 @@ class Updates:
         demonstrations: loading.Demonstrations | None,
         experts: ExpertEpisodes | None,
     ) -> None:
-        """Copies the frames to the device, if they are to be there.
+        """Copies the frames to the device if `replay_on_device` is set.
 
         Args:
           config: checked.
           agent: the compiled steps.
-          replay: filled already, on a resume.
+          replay: already filled when a run is resumed.
           demonstrations: what the method imitates, or None.
           experts: the same on the device, for methods that match whole episodes.
         """
@@ -66,15 +66,15 @@ class Updates:
         return bool(self._pending)
 
     def collect(self, rng: np.random.Generator) -> bool:
-        """Samples for one update; returns whether there are enough to be run.
+        """Samples for one update; returns whether a full group is pending.
 
-        Until they are run, no episode may enter the replay.
+        No episode may enter the replay until they have run.
         """
         self._pending.append(self.sample(rng))
         return len(self._pending) >= self._config.updates_per_dispatch
 
     def run(self, state: TrainState) -> tuple[TrainState, Metrics | None]:
-        """Runs what is collected.
+        """Runs the collected updates.
 
         Args:
           state: donated.
@@ -87,19 +87,19 @@ class Updates:
         if len(pending) > 1 and len(pending) == self._config.updates_per_dispatch:
             batches = jax.tree.map(lambda *leaves: np.stack(leaves), *pending)
             return self._agent.repeated_step(state, *batches, frames)
-        # Fewer, because an episode or a budget ended: a scan of another length would
-        # have to be compiled.
+        # An episode or the budget ended early. One by one, since a scan of another
+        # length would have to be compiled.
         for batch, expert in pending:
             state, metrics = self._agent.update_step(state, batch, expert, frames)
         return state, metrics
 
     def episode_added(self) -> None:
-        """Follows the replay, after an episode has entered it."""
+        """Updates the device copy after an episode has entered the replay."""
         if self._device_copy is not None:
             self._device_copy.refresh()
 
     def refresh_rewards(self, state: TrainState) -> None:
-        """Recomputes the rewards of all stored episodes with the rewarder as it is.
+        """Recomputes the rewards of all stored episodes with the current rewarder.
 
         Args:
           state: read; not donated.
@@ -114,7 +114,7 @@ class Updates:
         for indices in by_length.values():
             for first in range(0, len(indices), _REFRESH_EPISODES):
                 chunk = indices[first : first + _REFRESH_EPISODES]
-                # Always of one size, so that it is compiled once for each length.
+                # Always of one size, so that each episode length compiles once.
                 padded = chunk + chunk[-1:] * (_REFRESH_EPISODES - len(chunk))
                 rewards = self._refreshed(state, padded)[: len(chunk)]
                 for index, new in zip(chunk, rewards, strict=True):
@@ -152,24 +152,22 @@ class Updates:
         """Samples what one update learns from."""
         rewarder, batch = self._agent.rewarder, None
         if self._plays:
-            on_host = self._device_copy is None
-            sample = self._replay.sample if on_host else self._replay.sample_indices
-            batch = sample(
+            batch = self._replay.sample(
                 rng,
                 self._config.batch_size,
                 windows=rewarder.relabel is not None,
                 successors=rewarder.samples_successors,
+                as_indices=self._device_copy is not None,
             )
         if not rewarder.expert_batch_size:
             return batch, None
         assert self._demonstrations is not None
-        on_host = self._expert_frames is None
-        sample = loading.sample if on_host else loading.sample_indices
-        expert = sample(
+        expert = loading.sample(
             self._demonstrations,
             rng,
             rewarder.expert_batch_size,
             frame_stack=stack_size(self._config),
             successors=rewarder.samples_successors,
+            as_indices=self._expert_frames is not None,
         )
         return batch, expert

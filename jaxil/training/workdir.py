@@ -1,4 +1,4 @@
-"""The folder of a run: who may write there, and with which settings."""
+"""The folder of a run: one process at a time, always with the same settings."""
 
 import contextlib
 import json
@@ -57,7 +57,7 @@ def from_flag(value: str | None) -> pathlib.Path:
 
 
 def problems(workdir: pathlib.Path, config: Config) -> list[Fault]:
-    """Returns every reason why a run cannot live in a folder.
+    """Returns every reason why a run cannot use a folder.
 
     Args:
       workdir: need not exist; it is not created.
@@ -102,9 +102,9 @@ def problems(workdir: pathlib.Path, config: Config) -> list[Fault]:
 
 @contextlib.contextmanager
 def opened(workdir: pathlib.Path) -> Iterator[None]:
-    """Creates the folder and keeps other processes out of it while it is open.
+    """Creates the folder and locks it against other processes.
 
-    What killed processes left unfinished there is removed.
+    Removes unfinished files of killed processes.
 
     Raises:
       UsageError: the folder is not writable or in use.
@@ -133,7 +133,7 @@ def writes_to(workdir: pathlib.Path) -> Iterator[None]:
     """Turns an OSError in the block, where a run's own files are written, into one.
 
     Raises:
-      RunFolderError: names the fault, the newest checkpoint and the way out.
+      RunFolderError: names the fault, the newest checkpoint and what to do.
     """
     try:
         yield
@@ -164,8 +164,8 @@ def newest_checkpoint(workdir: pathlib.Path) -> int | None:
 def read_config(workdir: pathlib.Path, *, imports_task: bool = True) -> Config:
     """Returns the config of the run in a folder, whoever wrote it.
 
-    Fields that did not exist when it was written have their defaults: these are what
-    was done before there was a choice. Those that no longer exist are left out.
+    Fields that are newer than the run have their defaults, which are how older versions
+    behaved. Fields that no longer exist are left out.
 
     Raises:
       UsageError: there is none, it cannot be read, or its method is neither installed
@@ -202,7 +202,7 @@ def read_config(workdir: pathlib.Path, *, imports_task: bool = True) -> Config:
 def write_config(
     workdir: pathlib.Path, config: Config, machine: dict[str, Any]
 ) -> None:
-    """Writes config.json: every setting in force, and what it runs on.
+    """Writes config.json: all settings, and the machine.
 
     Raises:
       RunFolderError: the folder is not writable.

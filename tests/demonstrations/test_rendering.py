@@ -16,6 +16,7 @@ import pytest
 from jaxil.demonstrations import rendering
 from jaxil.environments.suite import make_environment
 from tests.commands import ROOT
+from tests.processes import wait_until_gone
 
 TASK = "finger_turn_hard"  # its target is not part of the simulator's state
 SEED, FIRST, EPISODES, LENGTH, SIZE = 5, 3, 3, 20, 24
@@ -192,10 +193,7 @@ def test_a_parent_that_is_stopped_leaves_nothing(number, alone, tmp_path):
     else:
         parent.kill()
     rest, errors = parent.communicate(timeout=60)
-    end = time.monotonic() + 30
-    while any(map(is_there, pids)):
-        assert time.monotonic() < end, "processes were left behind"
-        time.sleep(0.05)
+    wait_until_gone(pids)
     if number == signal.SIGINT:
         assert rest == "stopped\n"
         assert errors == ""
@@ -203,14 +201,6 @@ def test_a_parent_that_is_stopped_leaves_nothing(number, alone, tmp_path):
     found = pixels_in(tmp_path / "cache")
     assert found.items() <= alone[1].items()
     assert found, "the first episode was whole"
-
-
-def is_there(pid):
-    try:
-        status = pathlib.Path(f"/proc/{pid}/stat").read_text().rsplit(")")[-1]
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-    return status.split()[0] != "Z"  # dead, and its new parent has not looked yet
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ import pytest
 from jaxil.environments.player import InProcess, Player
 from jaxil.environments.pool import EnvironmentsFailed, Pool
 from jaxil.environments.suite import make_environment
+from tests.processes import is_alive, wait_until_gone
 
 ROOT = pathlib.Path(__file__).parent.parent.parent
 STEPS = 4
@@ -89,21 +90,6 @@ def assert_counted(episodes):
         np.testing.assert_array_equal(episode.discounts, 0.5)
 
 
-def is_there(pid):
-    try:
-        state = pathlib.Path(f"/proc/{pid}/stat").read_text().rsplit(")")[-1].split()[0]
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-    return state != "Z"  # dead, and its new parent has not looked yet
-
-
-def wait_until_gone(pids):
-    end = time.monotonic() + 30
-    while any(map(is_there, pids)):
-        assert time.monotonic() < end, "processes were left behind"
-        time.sleep(0.05)
-
-
 def test_episodes_are_those_of_a_single_environment():
     make = functools.partial(
         make_environment,
@@ -145,7 +131,7 @@ def test_several_processes_play_and_none_is_left():
     # Pids of seven digits are still exact in float32.
     assert seen_pids == {float(pid) for pid in pids}
     pool.close()
-    assert not any(map(is_there, pids))
+    assert not any(map(is_alive, pids))
     pool.close()  # again does nothing
 
 
@@ -167,7 +153,7 @@ def test_a_lost_process_is_replaced_and_its_episode_played_again(sent, said):
         assert_counted(play(pool, 4, each_round=lose_one))
         assert pool.pids[1] == first_pids[1]
         assert pool.pids[0] != first_pids[0]
-        assert not is_there(first_pids[0])
+        assert not is_alive(first_pids[0])
     steps = [{0: 0, 1: 0}, {0: 1, 1: 1}, {0: 2, 1: 2}, {0: 0, 1: 3}]
     assert rounds[:4] == steps
     (line,) = lines
@@ -182,7 +168,7 @@ def test_an_error_of_the_environment_is_told_in_full():
         play(pool, 2, lambda seen: np.where(seen[:, :1] == 11, -1.0, 1.0))
     assert "environment 1 raised an error:\nTraceback" in str(caught.value)
     assert "ArithmeticError: the simulation exploded" in str(caught.value)
-    assert not any(map(is_there, pids))
+    assert not any(map(is_alive, pids))
 
 
 def test_processes_that_never_get_far_are_given_up():
@@ -224,12 +210,12 @@ def test_processes_end_with_their_parent(way, tmp_path):
     pids = [int(word) for word in parent.stdout.readline().split()]
     assert len(pids) == 2
     if way == "kill":
-        assert all(map(is_there, pids))
+        assert all(map(is_alive, pids))
         # Ctrl-C goes to all processes of a terminal; the parent alone decides.
         for pid in pids:
             os.kill(pid, signal.SIGINT)
         time.sleep(0.2)
-        assert all(map(is_there, pids))
+        assert all(map(is_alive, pids))
         parent.kill()
     parent.communicate(timeout=60)
     wait_until_gone(pids)

@@ -4,13 +4,13 @@ import importlib.metadata
 import json
 import os
 import pathlib
-import subprocess
 import sys
 
 import pytest
 
 from jaxil.machine import devices, startup
 from jaxil.machine.cache import cache_folder
+from tests.processes import run_python
 
 OWN_VARIABLES = (
     "MUJOCO_GL",
@@ -113,16 +113,8 @@ def test_it_runs_before_jax_and_mujoco(tmp_path):
         "import jax; total = float(jax.numpy.arange(4).sum());"
         "print(json.dumps([said, early, total]))"
     )
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "JAXIL_CACHE": str(tmp_path)}
-    result = subprocess.run(
-        [sys.executable, "-c", code],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr
-    said, early, total = json.loads(result.stdout)
+    printed = run_python(code, JAX_PLATFORMS="cpu", JAXIL_CACHE=str(tmp_path))
+    said, early, total = json.loads(printed)
     assert early == []
     assert total == 6.0
     assert "GL " in said
@@ -191,15 +183,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 def _new_pages(**variables: str) -> int:
     """Returns the pages that four blocks of 64 MB cost, after a first one."""
-    environment = {**os.environ, **variables}
-    finished = subprocess.run(
-        [sys.executable, "-c", _NEW_PAGES],
-        env=environment,
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    return int(finished.stdout)
+    return int(run_python(_NEW_PAGES, **variables))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="mallopt is glibc's")
@@ -223,9 +207,7 @@ print("no such address space" if block is None else end - libc.sbrk(0))
 
 @pytest.mark.skipif(sys.platform != "linux", reason="mallopt is glibc's")
 def test_freed_memory_is_kept_beyond_what_an_int_counts():
-    given_back = subprocess.run(
-        [sys.executable, "-c", _HEAP_END], check=True, capture_output=True, text=True
-    ).stdout.strip()
+    given_back = run_python(_HEAP_END).strip()
     if given_back == "no such address space":
         pytest.skip(given_back)
     assert given_back == "0"

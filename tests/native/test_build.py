@@ -3,10 +3,7 @@
 import configparser
 import os
 import pathlib
-import shutil
 import stat
-import subprocess
-import sys
 
 import jax
 import pytest
@@ -17,6 +14,7 @@ from jaxil.machine import cache
 from jaxil.native import build
 from jaxil.training import agent as agents
 from jaxil.training import assembly
+from tests.processes import run_python
 
 NOT_FOR_THESE = (
     {"compute_dtype": "bfloat16"},
@@ -93,7 +91,7 @@ def test_a_damaged_library_is_rebuilt(tmp_path, damage):
     flipped = whole[:half] + bytes([whole[half] ^ 1]) + whole[half + 1 :]
     path.write_bytes({"empty": b"", "truncated": whole[:half]}.get(damage, flipped))
     # Loading it would kill the process.
-    subprocess.run([sys.executable, "-c", _LOAD, str(tmp_path)], check=True)
+    run_python(_LOAD, str(tmp_path))
     assert build._is_whole(path)
     assert os.listdir(tmp_path) == [path.name]
 
@@ -123,10 +121,10 @@ def test_other_flags_are_another_library(tmp_path):
     assert len(os.listdir(tmp_path)) == 2
 
 
+@pytest.mark.usefixtures("quick_compiler")
 def test_the_users_compiler_is_taken_with_its_options(tmp_path, monkeypatch):
     seen = tmp_path / "seen"
-    real = shutil.which("gcc")
-    script = f'echo "$1" > {seen}; shift; exec {real} "$@"'
+    script = f'echo "$1" > {seen}; shift; exec {os.environ["CC"]} "$@"'
     monkeypatch.setenv("CC", compiler_that(tmp_path, script) + " --first")
     assert build.build(tmp_path / "cache").exists()
     assert seen.read_text() == "--first\n"

@@ -2,8 +2,6 @@
 
 import functools
 import pathlib
-import subprocess
-import sys
 from concurrent import futures
 from typing import Any
 
@@ -18,6 +16,7 @@ from hypothesis import strategies as st
 from jaxil.maths import convolution
 from jaxil.native import build, encoding
 from jaxil.native.encoding import Weights
+from tests.processes import run_python
 
 with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
 
@@ -139,7 +138,7 @@ class ByHandTest(chex.TestCase):
         np.testing.assert_array_equal(to_unit, np.full(to_unit.shape, 15.0 * 9 * 32))
 
 
-@settings(derandomize=True, max_examples=40, deadline=None)
+@settings(derandomize=True, max_examples=12, deadline=None)
 @given(data=st.data())
 def test_value_and_gradients_of_any_encoder(data):
     layers, height, width = [], 1, 1
@@ -285,17 +284,6 @@ def test_rejects_what_does_not_fit(wrong):
         )
 
 
-def run_alone(text: str, *arguments: str) -> str:
-    """Runs Python text in a process of its own and returns what it prints."""
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", text, *arguments],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return done.stdout
-
-
 DRAWN = """
 import ctypes, hashlib, os, pathlib, sys
 cores = sorted(os.sched_getaffinity(0))
@@ -326,7 +314,7 @@ print([hashlib.sha256(np.asarray(a)).hexdigest() for a in both(ours)])
 
 
 def test_results_do_not_depend_on_the_number_of_threads():
-    assert run_alone(DRAWN + HASHES, "1") == run_alone(DRAWN + HASHES, "8")
+    assert run_python(DRAWN + HASHES, "1") == run_python(DRAWN + HASHES, "8")
 
 
 OTHER_PROCESSOR = """
@@ -350,4 +338,4 @@ def test_vectors_of_either_length_compute_the_same(kind, tmp_path):
     if {"x86-64-v3": " avx2 ", "x86-64-v4": " avx512vl "}[kind] not in flags:
         pytest.skip(f"this processor is no {kind}")
     text = DRAWN + OTHER_PROCESSOR
-    assert run_alone(text, "8", str(tmp_path), f"-march={kind}") == "equal\n"
+    assert run_python(text, "8", str(tmp_path), f"-march={kind}") == "equal\n"

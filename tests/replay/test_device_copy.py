@@ -69,12 +69,12 @@ def test_stacks_from_the_device_are_those_of_the_host(
     np.testing.assert_array_equal(copy.frames[slots], replay.frames[slots])
     if not replay.can_sample():
         return
-    whole, places = (
-        draw(np.random.default_rng(seed), BATCH, windows=windows)
-        for draw in (replay.sample, replay.sample_indices)
+    whole, indices = (
+        replay.sample(np.random.default_rng(seed), BATCH, windows=windows, as_indices=x)
+        for x in (False, True)
     )
-    assert places.observation.dtype == np.int32
-    gathered = GATHER(copy.frames, places)
+    assert indices.observation.dtype == np.int32
+    gathered = GATHER(copy.frames, indices)
     leaves = jax.tree.leaves(gathered), jax.tree.leaves(whole)
     for ours, theirs in zip(*leaves, strict=True):
         assert ours.dtype == theirs.dtype
@@ -84,7 +84,7 @@ def test_stacks_from_the_device_are_those_of_the_host(
 def test_expert_frames_lie_end_to_end():
     frames = np.arange(2 * 4 * 3, dtype=np.float32).reshape(2, 4, 3)
     drawn = ExpertBatch(np.array([[5], [0]], np.int32), np.zeros((2, 0)))
-    # Place 5 is the second frame of the second episode.
+    # Index 5 is the second frame of the second episode.
     expected = [frames[1, 1], frames[0, 0]]
     np.testing.assert_array_equal(gather_expert(frames, drawn).observation, expected)
 

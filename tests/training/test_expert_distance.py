@@ -73,7 +73,7 @@ def test_the_expert_itself_is_at_zero_and_a_random_policy_at_one(tmp_path, monke
     monkeypatch.setattr(expert_distance, "evaluate", spy)
     config, own, other = small_config(), draw(0, 21), draw(2, 21)
     half = np.concatenate([own[:11], other[11:]])
-    measure = expert_distance.Closeness(config, tmp_path, demonstrations(own, own))
+    measure = expert_distance.ExpertDistance(config, tmp_path, demonstrations(own, own))
     expert, near, far = (
         measure.relative_distance([episode(frames)]) for frames in (own, half, other)
     )
@@ -99,7 +99,7 @@ def test_a_stored_distance_is_used_if_it_verifies(tmp_path, monkeypatch):
     )
     path = tmp_path / "random_policy.json"
     own = demonstrations(draw(0, 21))
-    measure = expert_distance.Closeness(small_config(), tmp_path, own)
+    measure = expert_distance.ExpertDistance(small_config(), tmp_path, own)
     agent = [episode(draw(2, 21))]
     expected = measure.relative_distance(agent)
     assert measure.relative_distance(agent) == expected
@@ -127,7 +127,7 @@ def test_what_fills_up_a_short_demonstration_does_not_count(tmp_path):
     )
     agent = [episode(draw(3, 21))]
     distances = [
-        expert_distance.Closeness(small_config(), tmp_path, each)._distance(agent)
+        expert_distance.ExpertDistance(small_config(), tmp_path, each)._distance(agent)
         for each in (demonstrations(short), filled)
     ]
     assert distances[0] == distances[1]

@@ -125,7 +125,7 @@ def _nothing_is_simulated(monkeypatch):
     monkeypatch.setattr(agents, "make_agent", lambda c, *_: make_agent(c.method))
     monkeypatch.setattr(learning_curve, "plot", lambda *_, **__: None)  # slow
     distance = types.SimpleNamespace(relative_distance=lambda episodes: None)
-    monkeypatch.setattr(parts, "Closeness", lambda *_: distance)
+    monkeypatch.setattr(parts, "ExpertDistance", lambda *_: distance)
 
 
 def make_run(folder, method="dac", **changes):

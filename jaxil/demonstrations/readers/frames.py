@@ -23,7 +23,7 @@ def resized(
     if frame.shape[:2] == size:
         return frame
     # Pillow's bilinear filter grows with the scale, which prevents aliasing.
-    wanted, image = size[::-1], Image.fromarray(frame)
+    wanted, image = (size[1], size[0]), Image.fromarray(frame)
     bilinear = Image.Resampling.BILINEAR
     if fit == "crop":
         return np.asarray(ImageOps.fit(image, wanted, bilinear))
