@@ -310,7 +310,7 @@ def _define(values: flags.FlagValues) -> None:
     text("policy", help="package.module:function, observation -> action, to record")
     text("task", help="for --policy: the task, as in configs")
     number("action_repeat", 2, "for --policy: frames of one step", 1, 100)
-    text("trust", help="package.module:name that the runs' folders may import")
+    command.define_trust(values)
     text("inspect", help="file or folder of any format, or task, to show")
     text("convert", help="file or folder to convert to pixels; also --convert IN OUT")
     text("output", help="NAME.npz; for --inspect a folder for contact sheet and video")

@@ -16,13 +16,13 @@ import ml_collections
 from absl import flags
 
 from jaxil import config as jaxil_config
-from jaxil import methods, presets
+from jaxil import methods, outside, presets
 from jaxil.config import Config
 from jaxil.errors import Fault, UsageError, unknown_name
 
 Define = Callable[[flags.FlagValues], None]
 
-_CONFIG = "config"
+_CONFIG, _TRUST = "config", "trust"
 _KINDS = {
     bool: "True or False",
     int: "a whole number",
@@ -66,9 +66,16 @@ def parse(argv: list[str], description: str, define: Define) -> flags.FlagValues
                 reason = str(error).split(": ", 1)[-1]
                 faults.append(Fault(f"--{name}", f"is wrong: {reason}"))
     values.mark_as_parsed()
+    for reference in values[_TRUST].value or () if _TRUST in values else ():
+        if ":" not in reference:
+            what = "is not package.module:name"
+            faults.append(Fault("--trust", what, value=reference))
+        outside.trust(reference)
     if _CONFIG in values:
         config = _load(config_words, values[_CONFIG].default, faults)
         values[_CONFIG].value = config
+        if config is not None:
+            outside.trust(str(config.task))
         if faults and config is not None:
             faults += _value_problems(config)  # in the same message
     if faults:
@@ -117,6 +124,17 @@ def define_config(values: flags.FlagValues, default: str | None = None) -> None:
         "METHOD:TASK for the paper's settings, tiny:METHOD,TASK for small ones, "
         "expert:TASK, or FILE.py[:ARGUMENT] with a get_config(); change a field with "
         "--config.FIELD=VALUE",
+        flag_values=values,
+    )
+
+
+def define_trust(values: flags.FlagValues) -> None:
+    """Adds `--trust=package.module:name`, code from outside that runs may name."""
+    flags.DEFINE_multi_string(
+        _TRUST,
+        [],
+        "package.module:name of a method or task from outside that runs may import; "
+        "may be repeated",
         flag_values=values,
     )
 

@@ -64,12 +64,7 @@ def main(argv: list[str]) -> None:
 
 def _define(values: flags.FlagValues) -> None:
     flags.DEFINE_string("workdir", None, "folder of the run", flag_values=values)
-    flags.DEFINE_string(
-        "trust",
-        None,
-        "package.module:name that the run's folder may import",
-        flag_values=values,
-    )
+    command.define_trust(values)
     flags.DEFINE_integer(
         "num_episodes", 10, "episodes to play", 1, 100_000, flag_values=values
     )

@@ -88,11 +88,12 @@ def serialized(policy: Any) -> bytes:
         (batch, *policy.observation_shape), policy.observation_dtype
     )
     act = jax.jit(lambda seen: mean_action(params.encoder, params.actor, seen))
-    return export.export(act, platforms=_PLATFORMS)(shape).serialize()
+    return bytes(export.export(act, platforms=_PLATFORMS)(shape).serialize())
 
 
 def _define(values: flags.FlagValues) -> None:
     flags.DEFINE_string("workdir", None, "folder of the run", flag_values=values)
+    command.define_trust(values)
     flags.DEFINE_string(
         "output",
         "policy",

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 from jaxil.demonstrations import foreign, rendering, states
 from jaxil.demonstrations.readers.recording import PixelEpisode, Recording
 from jaxil.environments import suite
-from jaxil.files.untrusted import printable
+from jaxil.errors import printable
 
 NUM_COLUMNS = 8  # images of an episode on the contact sheet
 _NUM_ROWS = 10  # episodes on the contact sheet

@@ -14,15 +14,17 @@ from jaxil.config import Config, default_config
 from jaxil.demonstrations import states
 from jaxil.demonstrations.states import DemonstrationError
 from jaxil.environments import tasks
-from jaxil.errors import Fault, UsageError
+from jaxil.errors import Fault, UsageError, printable
 from jaxil.files import locking, writing
 from jaxil.files.settings import as_stored, flat
+from jaxil.files.untrusted import read_regular
 
 # Its frame; a second number tells two checkpoints of one frame apart.
 CHECKPOINT = re.compile(r"frame_(\d{12,})(?:_(\d+))?")
 _SOURCE, _DIGEST = "demonstrations.source", "demonstrations_digest"
 # No file of a run takes longer between two writes.
 _LEFTOVER_SECONDS = 60.0
+_MAX_CONFIG_BYTES = 10**7
 
 
 class RunFolderError(Exception):
@@ -76,7 +78,7 @@ def problems(workdir: pathlib.Path, config: Config) -> list[Fault]:
     if not (workdir / "config.json").exists():
         return []
     try:
-        before = read_config(workdir, trusted=config.task)
+        before = read_config(workdir)
     except UsageError as error:
         return [Fault("workdir", f"cannot be resumed: {error}", value=str(workdir))]
     different = _differences(before, config)
@@ -159,25 +161,25 @@ def newest_checkpoint(workdir: pathlib.Path) -> int | None:
     return max((int(match[1]) for match in matches), default=None)
 
 
-def read_config(workdir: pathlib.Path, *, trusted: str | None = "") -> Config:
-    """Returns the config of the run in a folder.
-
-    Where it names a module of the user's own, so must the command line, unless
-    `trusted` is that name, or None, for those who import no task.
+def read_config(workdir: pathlib.Path) -> Config:
+    """Returns the config of the run in a folder, whoever wrote it.
 
     Fields that did not exist when it was written have their defaults: these are what
     was done before there was a choice. Those that no longer exist are left out.
 
     Raises:
-      UsageError: there is none, or it cannot be read.
+      UsageError: there is none, it cannot be read, or its method is neither installed
+        nor named by the user (see `methods.is_trusted`).
     """
     path = workdir / "config.json"
     try:
         stored = _read_json(path)["config"]
-        task = str(stored["task"])
-        if tasks.names_code(task) and trusted not in (task, None):
-            outside.require_named(task, "task", path)
-        config = default_config(stored["method"], task)
+        method, task = str(stored["method"]), str(stored["task"])
+        if ":" in method:
+            outside.require_trusted(method, "method", path)
+        if tasks.names_code(task):
+            outside.require_trusted(task, "task", path)
+        config = default_config(method, task)
         known = jaxil_config.fields(stored["method"])
         there = flat(stored)
         for field in known.keys() & there.keys():
@@ -224,13 +226,17 @@ def demonstrations_digest(config: Config) -> str | None:
 
 
 def _read_json(path: pathlib.Path) -> dict[str, Any]:
-    return json.loads(path.read_text())
+    return json.loads(read_regular(path, _MAX_CONFIG_BYTES))
 
 
 def _differences(there: Config, here: Config) -> list[str]:
     before, now = flat(as_stored(there.to_dict())), flat(as_stored(here.to_dict()))
     return [
-        f"{field}: {before.get(field)!r} there, {now.get(field)!r} here"
+        f"{field}: {_shown(before, field)} there, {_shown(now, field)} here"
         for field in sorted(before.keys() | now.keys())
         if before.get(field) != now.get(field) and field not in jaxil_config.FREE_FIELDS
     ]
+
+
+def _shown(settings: dict[str, Any], field: str) -> str:
+    return printable(repr(settings.get(field)), 100)
