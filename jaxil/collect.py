@@ -239,7 +239,7 @@ def _convert(values: flags.FlagValues) -> None:
                 image_size=values.image_size or _CONVERTED_SIZE,
                 keep_aspect=values.image_size is None,
                 fit=values.fit,
-                camera=values.camera,
+                camera=values.camera or "",
             )
         own.write_pixels(output, recording, origin=f"{recording.kind}, {path.name}")
     print(
@@ -331,7 +331,7 @@ def _define(values: flags.FlagValues) -> None:
         "how --convert --image_size makes squares of frames that are not",
         flag_values=values,
     )
-    text("camera", default="", help="of a LeRobot dataset with several")
+    text("camera", help="of a LeRobot dataset with several")
     number("frame_skip", 1, "--convert keeps every N-th frame of pixels", 1, 10_000)
 
 

@@ -1,6 +1,7 @@
 """What README and CONTRIBUTING tell people to type is understood."""
 
 import importlib
+import importlib.util
 import re
 import shlex
 

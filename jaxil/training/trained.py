@@ -105,7 +105,7 @@ def load_policy(folder: str | os.PathLike) -> Policy:
     """
     devices.device_name()  # a wrong JAX_PLATFORMS is said first
     folder = pathlib.Path(folder).expanduser()
-    config = workdir.read_config(folder)
+    config = workdir.read_config(folder, imports_task=False)
     faults = jaxil_config.problems(config, known_tasks=(config.task,))
     if faults:
         raise UsageError(f"{folder / 'config.json'}: {'; '.join(map(str, faults))}")
@@ -144,6 +144,7 @@ def load(folder: str | os.PathLike) -> Trained:
     Raises:
       UsageError: see `load_policy`.
     """
+    workdir.read_config(pathlib.Path(folder))  # whose task is imported below
     policy = load_policy(folder)
     config, demonstrations = policy.config, None
     try:
