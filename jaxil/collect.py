@@ -239,7 +239,7 @@ def _convert(values: flags.FlagValues) -> None:
                 image_size=values.image_size or _CONVERTED_SIZE,
                 keep_aspect=values.image_size is None,
                 fit=values.fit,
-                camera=values.camera,
+                camera=values.camera or "",
             )
         own.write_pixels(output, recording, origin=f"{recording.kind}, {path.name}")
     print(

@@ -93,6 +93,7 @@ def serialized(policy: Any) -> bytes:
 
 def _define(values: flags.FlagValues) -> None:
     flags.DEFINE_string("workdir", None, "folder of the run", flag_values=values)
+    command.define_trust(values)
     flags.DEFINE_string(
         "output",
         "policy",
