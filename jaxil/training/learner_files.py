@@ -5,8 +5,12 @@ record           JSON: shapes and types of the arrays, and what else is needed
 checksums.json   CRC-32 of each file
 """
 
+import errno
 import json
+import os
 import pathlib
+import re
+import tempfile
 import zlib
 from typing import Any
 
@@ -19,6 +23,7 @@ from jaxil.files.untrusted import read_regular
 
 _FORMAT = 1
 _CHECKSUMS = "checksums.json"
+_ROOM_BYTES = 2**17  # for what is written beside the arrays
 _MAX_BYTES = 2**40  # of a file: no limit for true ones
 
 
@@ -62,6 +67,7 @@ def write(
             "key_type": key_type,
         }
     record = {**record, "format": _FORMAT, "leaves": leaves}
+    _require_room(folder.parent, sum(array.nbytes for array in stored.values()))
     try:
         with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
             checkpointer.save(
@@ -71,7 +77,9 @@ def write(
                     record=ocp.args.JsonSave(record),
                 ),
             )
-    except ValueError as error:  # tensorstore's, such as on a full disk
+    except ValueError as error:  # tensorstore's
+        if code := re.search(r"os_error_code='(\d+)'", str(error)):
+            raise OSError(int(code[1]), os.strerror(int(code[1]))) from error
         raise OSError(_one_line(error)) from error
     for name, array in arrays.items():
         np.save(folder / f"{name}.npy", array)
@@ -138,6 +146,16 @@ def as_state(abstract_state: Any, record: dict, arrays: dict[str, np.ndarray]) -
         more = f" and {len(faults) - 5} more" if len(faults) > 5 else ""
         raise OtherLearnerError("; ".join(printable(f, 200) for f in faults[:5]) + more)
     return jax.tree.unflatten(jax.tree.structure(abstract_state), leaves)
+
+
+def _require_room(folder: pathlib.Path, num_bytes: int) -> None:
+    """Raises OSError on a full disk, on which threads of orbax print tracebacks."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            os.posix_fallocate(file.fileno(), 0, num_bytes + _ROOM_BYTES)
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise
 
 
 def _named_leaves(tree: Any) -> list[tuple[str, Any]]:

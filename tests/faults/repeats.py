@@ -20,7 +20,6 @@ from typing import Any
 METHODS = "pdac,psil,temporal_ot,orca,dac,sil,bc,drqv2,zero"
 # Large enough for XLA to divide the work of an update among cores.
 SIDE, BATCH, HIDDEN = 20, 16, 256
-_SECONDS = 1800.0
 
 
 def measure(methods: Sequence[str], repeats: int) -> Iterator[dict[str, Any]]:

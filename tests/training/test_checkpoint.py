@@ -500,7 +500,7 @@ def test_an_odd_newest_checkpoint_falls_back(tmp_path, spoil):
     assert names == ["frame_000000000001", "frame_000000000003"]
 
 
-@pytest.mark.parametrize("what", ["episode", "learner", "folder"])
+@pytest.mark.parametrize("what", ["episode", "room", "learner", "folder"])
 def test_a_full_disk_leaves_the_checkpoint_before(tmp_path, monkeypatch, what):
     checkpoints, replay = Checkpoints(tmp_path), make_replay()
     add_episodes(replay, 1)
@@ -511,11 +511,18 @@ def test_a_full_disk_leaves_the_checkpoint_before(tmp_path, monkeypatch, what):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     def fail_in_tensorstore(*_, **__):
-        raise ValueError("RESOURCE_EXHAUSTED: No space left on device")
+        name = "x" * 300
+        raise ValueError(
+            f"RESOURCE_EXHAUSTED: Error writing {name}: Failed to write 59188 bytes to "
+            "file 15: No space left on device [os_error_code='28']"
+        )
 
     with monkeypatch.context() as patched:
         if what == "episode":
             patched.setattr(np.lib.format, "write_array", fail)
+        elif what == "room":
+            patched.setattr("os.posix_fallocate", fail)
+            patched.setattr(orbax.checkpoint.Checkpointer, "save", None)
         elif what == "learner":
             patched.setattr(orbax.checkpoint.Checkpointer, "save", fail_in_tensorstore)
         else:
