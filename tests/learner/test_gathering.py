@@ -99,7 +99,10 @@ def test_four_updates_in_one_call_are_four_calls_and_copy_no_frames():
         state, metrics = SINGLE(state, *sampled, frames)
     # The same frames at the start of a large replay, of 22 MB.
     shape = (50_000, SIDE, SIDE, 3)
-    arguments = (*as_many(*samples), frames._replace(agent=np.resize(frames[0], shape)))
+    arguments = (
+        *as_many(*samples),
+        frames._replace(agent=np.resize(np.asarray(frames.agent), shape)),
+    )
     step = jax.jit(make_repeated_step(STEP), donate_argnums=0)
     repeated = step.lower(start, *arguments).compile()
     memory = repeated.memory_analysis()
