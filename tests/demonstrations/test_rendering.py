@@ -76,7 +76,8 @@ def pixels_in(folder):
 
 def children() -> list[int]:
     """Returns the processes of multiprocessing that this one has started."""
-    return [process.pid for process in multiprocessing.active_children()]
+    found = (process.pid for process in multiprocessing.active_children())
+    return [pid for pid in found if pid is not None]
 
 
 def test_two_processes_render_what_one_renders(alone, tmp_path, caplog):
