@@ -177,7 +177,10 @@ def _brute_force_transport_cost(x, y, epsilon):
 def test_sinkhorn_divergence_against_brute_force():
     rng, epsilon = np.random.default_rng(0), 0.2
     x, y = (jnp.asarray(rng.normal(size=(n, 4)), jnp.float32) for n in (7, 5))
-    ours = transport.sinkhorn_divergence(x, y, epsilon=epsilon, num_iterations=300)
+    divergence = functools.partial(
+        transport.sinkhorn_divergence, epsilon=epsilon, num_iterations=300
+    )
+    ours = jax.jit(divergence)(x, y)
 
     def cost(one, other):
         return _brute_force_transport_cost(one, other, epsilon)
