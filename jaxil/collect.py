@@ -303,9 +303,8 @@ def _define(values: flags.FlagValues) -> None:
         flag_values=values,
     )
     text("policy", help="package.module:function, observation -> action, to record")
-    text("task", help="for --policy: the task, as in configs")
+    text("task", help="for --policy; or of the runs, if it is code of your own")
     number("action_repeat", 2, "for --policy: frames of one step", 1, 100)
-    text("trust", help="package.module:name that the runs' folders may import")
     text("inspect", help="file or folder of any format to summarise")
     text("convert", help="file or folder to convert to pixels; also --convert IN OUT")
     text("output", help="NAME.npz; for --inspect a folder for contact sheet and video")

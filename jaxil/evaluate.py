@@ -63,9 +63,9 @@ def main(argv: list[str]) -> None:
 def _define(values: flags.FlagValues) -> None:
     flags.DEFINE_string("workdir", None, "folder of the run", flag_values=values)
     flags.DEFINE_string(
-        "trust",
+        "task",
         None,
-        "package.module:name that the run's folder may import",
+        "package.module:function of a run with a task of your own; its code is run",
         flag_values=values,
     )
     flags.DEFINE_integer(

@@ -11,6 +11,13 @@ from typing import Any
 
 from jaxil.errors import Fault, UsageError
 
+_confirmed: set[str] = set()
+
+
+def confirm(reference: str) -> None:
+    """Lets files name this code; for programs, which have no command line of ours."""
+    _confirmed.add(reference)
+
 
 def load(reference: str, subject: str) -> Any:
     """Imports a module and returns what it calls by that name.
@@ -47,13 +54,14 @@ def require_named(reference: str, subject: str, where: object) -> None:
     Raises:
       UsageError: it is not one of this command line's values.
     """
-    given = {part for word in sys.argv[1:] for part in re.split("[=,]", word)}
-    if reference not in given:
+    given = re.split("[=,\0]", "\0".join(sys.argv[1:]))
+    if reference not in _confirmed.union(given):
         raise UsageError(
             Fault(
                 subject,
                 f"stands in {where}, and is code that this command line does not name",
-                f"if you trust it, add --trust={reference}",
+                f"if you trust it, name it yourself with --{subject}={reference} "
+                "(Python: jaxil.outside.confirm)",
                 reference,
             )
         )

@@ -139,14 +139,14 @@ def test_a_task_from_outside_is_recorded_trained_resumed_and_shown(
         assert evaluated.returncode == 0, evaluated.stderr
     else:  # the folder alone may not make Python import anything
         assert evaluated.returncode == 2
-        assert f"--trust={task}" in evaluated.stderr
-        trusted = (f"--workdir={workdir}", "--num_episodes=1", f"--trust={task}")
+        assert f"--task={task}" in evaluated.stderr
+        trusted = (f"--workdir={workdir}", "--num_episodes=1", f"--task={task}")
         evaluated = run("evaluate", *trusted)
         assert evaluated.returncode == 0, evaluated.stderr
     assert "the expert's mean" in evaluated.stdout
     reported = run("report", str(workdir.parent), f"--output={tmp_path / 'report'}")
     assert reported.returncode == 0, reported.stderr
-    assert task in (tmp_path / "report" / "report.html").read_text()
+    assert task in (tmp_path / "report" / "index.html").read_text()
 
 
 def test_faults_of_tasks_are_one_message_each(tmp_path):
