@@ -198,6 +198,7 @@ def _inspect(values: flags.FlagValues) -> None:
             image_size=values.image_size or _INSPECTED_SIZE,
             render_quality=values.render_quality,
             max_bytes=memory.spare_bytes(),
+            camera=values.camera or "",
         )
     name = path.resolve().stem
     # Never the input itself, which may be a video in this folder.
@@ -234,7 +235,7 @@ def _convert(values: flags.FlagValues) -> None:
                 image_size=values.image_size or _CONVERTED_SIZE,
                 keep_aspect=values.image_size is None,
                 fit=values.fit,
-                camera=values.camera,
+                camera=values.camera or "",
             )
         own.write_pixels(output, recording, origin=f"{recording.kind}, {path.name}")
     print(
@@ -325,7 +326,7 @@ def _define(values: flags.FlagValues) -> None:
         "how --convert --image_size makes squares of frames that are not",
         flag_values=values,
     )
-    text("camera", "", help="of a LeRobot dataset with several")
+    text("camera", help="of a LeRobot dataset with several")
     number("frame_skip", 1, "--convert keeps every N-th frame of pixels", 1, 10_000)
 
 

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from jaxil import collect
-from jaxil.demonstrations import foreign
+from jaxil.config import default_config
+from jaxil.demonstrations import foreign, states
+from jaxil.errors import UsageError
+from jaxil.training import workdir
 from tests.commands import ROOT, run, small
 
 # A package of one file, as a user would write it: a light that can be pushed around.
@@ -162,6 +165,23 @@ def test_faults_of_tasks_are_one_message_each(tmp_path):
         assert words in found[0], found
     assert "dm_control" in _problems("light:make", camera="side")[0]
     del tmp_path
+
+
+@pytest.mark.parametrize("task", ["harm:make", "gymnasium:harm:Harm-v0"])
+def test_a_folder_or_file_alone_makes_python_import_nothing(
+    task, tmp_path, monkeypatch
+):
+    (tmp_path / "harm.py").write_text("raise SystemExit('imported')")
+    workdir.write_config(tmp_path, default_config("zero", task), {})
+    with pytest.raises(UsageError, match=f"--task={task}"):
+        workdir.read_config(tmp_path)
+    stored = states.read_states(states.shipped_path("cartpole_swingup"), num_episodes=1)
+    stored = stored._replace(metadata={**stored.metadata, "task": task})
+    states.write_states(tmp_path / "states.npz", stored)
+    with pytest.raises(UsageError, match=f"--task={task}"):
+        collect.main(["collect", f"--inspect={tmp_path / 'states.npz'}"])
+    monkeypatch.setattr("sys.argv", ["jaxil", f"--task={task}"])
+    assert workdir.read_config(tmp_path).task == task
 
 
 def _problems(task, **changes):
