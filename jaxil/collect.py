@@ -199,6 +199,7 @@ def _inspect(values: flags.FlagValues) -> None:
             render_quality=values.render_quality,
             max_bytes=memory.spare_bytes(),
             camera=values.camera or "",
+            frame_skip=values.frame_skip,
         )
     name = path.resolve().stem
     # Never the input itself, which may be a video in this folder.
@@ -327,7 +328,7 @@ def _define(values: flags.FlagValues) -> None:
         flag_values=values,
     )
     text("camera", help="of a LeRobot dataset with several")
-    number("frame_skip", 1, "--convert keeps every N-th frame of pixels", 1, 10_000)
+    number("frame_skip", 1, "keeps every N-th frame of pixels", 1, 10_000)
 
 
 if __name__ == "__main__":

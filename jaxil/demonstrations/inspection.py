@@ -42,7 +42,12 @@ class Inspection(NamedTuple):
 
 
 def inspect(
-    path: pathlib.Path, *, max_bytes: int, camera: str = "", **view: Any
+    path: pathlib.Path,
+    *,
+    max_bytes: int,
+    camera: str = "",
+    frame_skip: int = 1,
+    **view: Any,
 ) -> Inspection:
     """Reads a demonstration file of any format; renders samples of simulator states.
 
@@ -50,6 +55,7 @@ def inspect(
       path: file or folder.
       max_bytes: limit of each unpacked array.
       camera: of a dataset with several.
+      frame_skip: keeps every n-th frame of pixels.
       view: `image_size` and `render_quality` for states; videos are shrunk until their
         shorter side is `image_size`.
 
@@ -66,6 +72,7 @@ def inspect(
         image_size=view["image_size"],
         keep_aspect=True,
         camera=camera,
+        frame_skip=frame_skip,
     )
     fps = recording.frames_per_second
     summaries, pictures, video = [], [], np.empty((0, 1, 1, 3), np.uint8)
