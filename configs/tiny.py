@@ -1,79 +1,9 @@
-r"""The preset that learns on two CPU cores: `configs/tiny.py:METHOD,TASK`.
+r"""The preset that learns on two CPU cores, the same as `--config=tiny:METHOD,TASK`.
 
     python -m jaxil.launch --config=configs/tiny.py:pdac,ball_in_cup_catch \
         --workdir=runs/tiny
-
-The paper's methods with smaller images, networks and batches, and rendering without
-shadows. Other deviations from the paper:
-
-- The mean image of the demonstrations is subtracted and the contrast raised, since a
-  small moving body is only a few pixels at 48x48.
-- The squared pre-tanh mean is penalised, since small actors saturate permanently.
-- Exploration ends sooner, the agent updates every step and learning rates are higher,
-  since runs have to be short.
-- The replay is smaller, so that its rewards are newer, and they are recomputed
-  (`reward_refresh_steps = 2_500`): those of the first episodes come from an untrained
-  discriminator and would teach the critic that random behaviour is best.
-- cartpole_swingup repeats actions 4 times: with 2, a pole at 1 rad/s moves a quarter of
-  a pixel between frames, which hides its speed, and agents only learned to spin it;
-  with 8, none learned to balance it. P-DAC's gradient penalty has weight 1 there.
 """
 
-from jaxil import config as jaxil_config
+from jaxil.presets.tiny import get_config
 
-_ACTION_REPEATS = {"cartpole_swingup": 4}
-_GRADIENT_PENALTIES = {("pdac", "cartpole_swingup"): 1.0}
-# These two have a separate encoder, and DAC needs its second derivatives: with 64, an
-# update takes five times as long.
-_DISCRIMINATOR_BATCHES = {"dac": 16, "sil": 16}
-
-
-def get_config(argument: str = "pdac,cartpole_swingup"):
-    """Returns the preset for `METHOD,TASK`."""
-    method, comma, task = argument.partition(",")
-    if not comma:
-        raise ValueError(
-            f"tiny.py:{argument} lacks the task: write METHOD,TASK, such as "
-            "configs/tiny.py:pdac,ball_in_cup_catch"
-        )
-    config = jaxil_config.default_config(method, task)
-    config.action_repeat = _ACTION_REPEATS.get(task, 2)
-    config.total_frames = 500_000
-    config.image_size = 48
-    config.render_quality = "fast"
-    config.encoder.channels = (32, 32, 32)
-    config.encoder.kernel_sizes = (4, 3, 3)
-    config.encoder.strides = (4, 1, 1)
-    config.encoder.contrast = 4.0
-    config.encoder.subtract_mean_image = True
-    config.shift_padding = 2
-    config.hidden_dim = 256
-    config.batch_size = 64
-    config.update_every_steps = 1
-    config.learning_rate = 3e-4
-    config.pre_tanh_penalty = 2e-3
-    config.replay_size_steps = 50_000
-    config.replay_on_device = True  # also on CPUs, where XLA stacks faster than NumPy
-    config.exploration_std_steps = 50_000
-    own = config.get("discriminator", {})
-    if "hidden_dim" in own:
-        own.hidden_dim = 256
-        own.gradient_penalty = _GRADIENT_PENALTIES.get((method, task), 10.0)
-    if own:
-        own.batch_size = _DISCRIMINATOR_BATCHES.get(method, 64)
-        own.learning_rate = 3e-4
-    transport = config.get("sinkhorn", {})
-    if transport:
-        transport.num_iterations = 50
-    if "target_update_steps" in transport:
-        transport.target_update_steps = 5_000 if config.action_repeat == 2 else 2_500
-    config.reward_refresh_steps = 2_500
-    config.eval_every_frames = 10_000
-    config.checkpoint_every_frames = 10_000
-    if "cloning" in config:
-        config.cloning.batch_size = 64
-    if config.action_repeat > 2:  # fewer agent steps in as many frames
-        config.exploration_steps = 500
-        config.exploration_std_steps = 20_000
-        config.replay_size_steps = 25_000
-    return config
+__all__ = ["get_config"]

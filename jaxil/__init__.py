@@ -1,1 +1,39 @@
-"""Imitation learning from pixel observations, in JAX."""
+"""Imitation learning from pixel observations, in JAX.
+
+    policy = jaxil.load_policy("runs/quickstart")
+    environment = jaxil.make_environment("cartpole_swingup", seed=0, action_repeat=4)
+    demonstrations = jaxil.load_demonstrations(task="cartpole_swingup")
+
+These are imported where they are first used, so that `import jaxil` takes no time, and
+choose OpenGL's and jax's settings before that, as the commands do.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jaxil.demonstrations.loading import load as load_demonstrations
+    from jaxil.environments.suite import make_environment
+    from jaxil.errors import UsageError
+    from jaxil.training.trained import load_policy
+
+__all__ = ["UsageError", "load_demonstrations", "load_policy", "make_environment"]
+
+_PLACES = {
+    "UsageError": ("jaxil.errors", "UsageError"),
+    "load_demonstrations": ("jaxil.demonstrations.loading", "load"),
+    "load_policy": ("jaxil.training.trained", "load_policy"),
+    "make_environment": ("jaxil.environments.suite", "make_environment"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name != "UsageError":
+        from jaxil.machine import startup
+
+        startup.prepare()
+    module, attribute = _PLACES[name]
+    globals()[name] = getattr(importlib.import_module(module), attribute)
+    return globals()[name]

@@ -1,8 +1,8 @@
 r"""Measures time and memory of each part of a run on this machine.
 
-    python -m jaxil.benchmark --config=configs/pdac_walker.py --json=benchmark.json
-    python -m jaxil.benchmark --config=configs/pdac_walker.py --compare=benchmark.json
-    python -m jaxil.benchmark --config=configs/pdac_walker.py \
+    jaxil benchmark --config=pdac:walker_walk --json=benchmark.json
+    jaxil benchmark --config=pdac:walker_walk --compare=benchmark.json
+    jaxil benchmark --config=pdac:walker_walk \
         --sweep=batch_size:64,128,256 --json=batch_sizes.json
 
 Times are medians over repeats, after a warm-up. The run is not kept. Compiling without

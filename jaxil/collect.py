@@ -1,6 +1,6 @@
 r"""Records, shows and converts demonstrations.
 
-    python -m jaxil.collect --workdirs=runs/expert0,runs/expert1 \
+    jaxil collect --workdirs=runs/expert0,runs/expert1 \
         --output=cartpole_swingup.npz --num_episodes=50
 
 evaluates the mean actions of the runs' policies and records the best. The file holds
@@ -13,8 +13,8 @@ are not dm_control's, it holds pixels.
 records a function of the task's own observation, a flat vector, that returns an action
 with all numbers in [-1, 1].
 
-    python -m jaxil.collect --inspect=FILE
-    python -m jaxil.collect --convert=IN --output=OUT.npz
+    jaxil collect --inspect=FILE
+    jaxil collect --convert=IN --output=OUT.npz
 
 summarise a file of any format, with a contact sheet and a video, and convert it to
 jaxil's format of pixels. Formats: jaxil states or pixels, ROT or PatchAIL pickles,
@@ -80,8 +80,8 @@ def _record(values: flags.FlagValues) -> None:
         )
         means.append(evaluation.mean)
         print(
-            f"{evaluation.mean:>8.1f}{evaluation.std:>8.1f}{run.frame:>10}"
-            f"{run.seconds / 60:>9.0f}  {folder}",
+            f"{evaluation.mean:>8.1f}{evaluation.std:>8.1f}{run.act.frame:>10}"
+            f"{run.act.seconds / 60:>9.0f}  {folder}",
             flush=True,
         )
     best = runs[int(np.argmax(means))]
@@ -91,7 +91,7 @@ def _record(values: flags.FlagValues) -> None:
         best.act,
         task=best.config.task,
         action_repeat=best.config.action_repeat,
-        expert=f"{best.description()}; mean action, no noise",
+        expert=f"{best.act.description()}; mean action, no noise",
     )
 
 
@@ -305,8 +305,9 @@ def _define(values: flags.FlagValues) -> None:
         flag_values=values,
     )
     text("policy", help="package.module:function, observation -> action, to record")
-    text("task", help="for --policy; or of the runs, if it is code of your own")
+    text("task", help="for --policy: the task, as in configs")
     number("action_repeat", 2, "for --policy: frames of one step", 1, 100)
+    command.define_trust(values)
     text("inspect", help="file or folder of any format to summarise")
     text("convert", help="file or folder to convert to pixels; also --convert IN OUT")
     text("output", help="NAME.npz; for --inspect a folder for contact sheet and video")

@@ -15,13 +15,13 @@ import ml_collections
 from absl import flags
 
 from jaxil import config as jaxil_config
-from jaxil import methods
+from jaxil import methods, outside, presets
 from jaxil.config import Config
 from jaxil.errors import Fault, UsageError, unknown_name
 
 Define = Callable[[flags.FlagValues], None]
 
-_CONFIG = "config"
+_CONFIG, _TRUST = "config", "trust"
 _KINDS = {
     bool: "True or False",
     int: "a whole number",
@@ -65,9 +65,16 @@ def parse(argv: list[str], description: str, define: Define) -> flags.FlagValues
                 reason = str(error).split(": ", 1)[-1]
                 faults.append(Fault(f"--{name}", f"is wrong: {reason}"))
     values.mark_as_parsed()
+    for reference in values[_TRUST].value or () if _TRUST in values else ():
+        if ":" not in reference:
+            what = "is not package.module:name"
+            faults.append(Fault("--trust", what, value=reference))
+        outside.trust(reference)
     if _CONFIG in values:
         config = _load(config_words, values[_CONFIG].default, faults)
         values[_CONFIG].value = config
+        if config is not None:
+            outside.trust(str(config.task))
         if faults and config is not None:
             faults += _value_problems(config)  # in the same message
     if faults:
@@ -113,8 +120,20 @@ def define_config(values: flags.FlagValues, default: str | None = None) -> None:
     flags.DEFINE_string(
         _CONFIG,
         default,
-        "configs/METHOD.py:TASK, or any file with get_config(); change a field with "
+        "METHOD:TASK for the paper's settings, tiny:METHOD,TASK for small ones, "
+        "expert:TASK, or FILE.py[:ARGUMENT] with a get_config(); change a field with "
         "--config.FIELD=VALUE",
+        flag_values=values,
+    )
+
+
+def define_trust(values: flags.FlagValues) -> None:
+    """Adds `--trust=package.module:name`, code from outside that runs may name."""
+    flags.DEFINE_multi_string(
+        _TRUST,
+        [],
+        "package.module:name of a method or task from outside that runs may import; "
+        "may be repeated",
         flag_values=values,
     )
 
@@ -176,7 +195,7 @@ def _load(
     files = [word for word in words if _name(word) == _CONFIG]
     value = files[-1].partition("=")[2] if files else default
     if not value:
-        rule, way_out = "is missing", "give a file, such as configs/pdac_walker.py"
+        rule, way_out = "is missing", "name one, such as --config=pdac:walker_walk"
         faults.append(Fault("--config", rule, way_out))
         return None
     overrides = {
@@ -197,15 +216,17 @@ def _load(
 
 
 def _config_of_file(value: str) -> Config:
-    """Runs get_config of FILE.py[:ARGUMENT]."""
+    """Runs get_config of FILE.py[:ARGUMENT], or of a preset, NAME[:ARGUMENT]."""
     name, colon, argument = value.partition(":")
     path = pathlib.Path(name).expanduser()
+    if path.suffix != ".py" and not path.is_file():
+        return presets.get_config(name, argument if colon else None).unlock()
     if not path.is_file():
         raise UsageError(
             Fault(
                 "--config",
                 f"names no file: there is no file {name!r} here",
-                "the presets are in configs/, such as configs/pdac.py:walker_walk",
+                "a preset needs none: METHOD:TASK, such as --config=pdac:walker_walk",
                 value,
             )
         )

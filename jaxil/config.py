@@ -11,7 +11,7 @@ from typing import Any
 
 import ml_collections
 
-from jaxil import methods
+from jaxil import methods, outside
 from jaxil.demonstrations.settings import DEMONSTRATIONS
 from jaxil.errors import Fault, UsageError, unknown_name
 from jaxil.methods import Field
@@ -174,6 +174,7 @@ def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Conf
         (config[group] if group else config)[leaf] = field.default
     config.method = method
     config.task = task
+    outside.trust(task)
     config.total_frames = _EASY_FRAMES if task in _EASY_TASKS else _HARD_FRAMES
     config.num_steps = 1 if task.startswith("walker") else 3
     if not declared.plays:

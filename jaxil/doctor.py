@@ -1,6 +1,6 @@
 r"""Checks whether this machine is ready for a run, and says what to do if not.
 
-    python -m jaxil.doctor [--config=configs/pdac.py:walker_walk] [--config.FIELD=V]
+    jaxil doctor [--config=pdac:walker_walk] [--config.FIELD=V]
 
 Prints one line per check: ok, warning or fault; what was checked; the result; advice.
 Without --config it checks for the paper's settings.
@@ -214,11 +214,13 @@ def _read_config(argv: list[str]) -> Any:
     """Returns the checked config; the paper's without --config."""
     from jaxil import command
     from jaxil import config as jaxil_config
-    from jaxil.environments import suite
 
     has_config = any(word.lstrip("-").startswith(("config", "h")) for word in argv[1:])
     define = command.define_config if has_config else lambda values: None
     values = command.parse(argv, __doc__ or "", define)
+    startup.prepare()
+    from jaxil.environments import suite
+
     config = values.config if has_config else jaxil_config.default_config()
     faults = jaxil_config.problems(config, suite.known_tasks())
     if faults:
@@ -228,14 +230,13 @@ def _read_config(argv: list[str]) -> Any:
 
 def main(argv: list[str]) -> int:
     """Prints the findings and returns the exit status."""
-    in_force = startup.prepare()
     config, num_faults = None, 0
     try:
         config = _read_config(argv)
     except (ImportError, AttributeError) as error:  # a broken jax or simulator
         print(Finding("fault", "packages", f"{type(error).__name__}: {error}"))
         num_faults = 1
-    print(Finding("ok", "set-up", in_force), flush=True)
+    print(Finding("ok", "set-up", startup.prepare()), flush=True)
     for finding in examine(config):
         print(finding, flush=True)
         num_faults += finding.level == "fault"

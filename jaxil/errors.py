@@ -6,7 +6,21 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 _SHORT_LIST = 12  # longer lists are cut
+_MAX_VALUE, _MAX_FAULT = 200, 4000  # letters that are shown
 _ABSENT = object()
+
+
+def printable(text: object, max_letters: int = 1000) -> str:
+    """Returns text on one line, without control characters and of bounded length.
+
+    Whatever comes from a file goes through it before it is shown: a terminal obeys
+    control characters.
+    """
+    letters = str(text)[: max_letters + 1]
+    shown = "".join(
+        c if c.isprintable() else " " if c.isspace() else "?" for c in letters
+    )
+    return shown if len(shown) <= max_letters else f"{shown[: max_letters - 3]}..."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +40,11 @@ class Fault:
     value: Any = _ABSENT
 
     def __str__(self) -> str:
-        given = "" if self.value is _ABSENT else f"={self.value!r}"
+        given = (
+            ""
+            if self.value is _ABSENT
+            else f"={printable(repr(self.value), _MAX_VALUE)}"
+        )
         end = f"; {self.way_out}" if self.way_out else ""
         return f"{self.subject}{given} {self.rule}{end}"
 
@@ -47,9 +65,10 @@ class UsageError(Exception):
         super().__init__(self.faults)
 
     def __str__(self) -> str:
-        if len(self.faults) == 1:
-            return str(self.faults[0])
-        return "Invalid configuration:\n" + "\n".join(f"  - {f}" for f in self.faults)
+        shown = [printable(fault, _MAX_FAULT) for fault in self.faults]
+        if len(shown) == 1:
+            return shown[0]
+        return "Invalid configuration:\n" + "\n".join(f"  - {f}" for f in shown)
 
 
 def unknown_name(subject: str, value: object, known: Sequence[str]) -> Fault:

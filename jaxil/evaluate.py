@@ -1,6 +1,6 @@
 r"""Evaluates the newest checkpoint of a run: returns, and a video.
 
-    python -m jaxil.evaluate --workdir=runs/pdac --num_episodes=50
+    jaxil evaluate --workdir=runs/pdac --num_episodes=50
 
 The policy takes its mean action. The run is not changed; the video is written to
 WORKDIR/videos/evaluation.mp4.
@@ -26,21 +26,22 @@ def main(argv: list[str]) -> None:
     print(startup.prepare(), file=sys.stderr, flush=True)
     from jaxil.environments.evaluation import evaluate
     from jaxil.files.video import write_video
-    from jaxil.training import run_log, trained
+    from jaxil.training import assembly, run_log, trained
 
     run = trained.load(folder)
+    gl_name = assembly.renderer_name(run.config)
     evaluation = evaluate(
         run.environment,
         run.act,
         num_episodes=values.num_episodes,
         first_episode=_FIRST_EPISODE,
-        record_video=True,
+        record_video=gl_name != "none",
     )
     for number, task_return in enumerate(evaluation.task_returns):
         print(f"episode {number}: {task_return:.1f}")
     returns = evaluation.task_returns
     line = (
-        f"{run.config.method} on {run.config.task}, frame {run.frame}: mean "
+        f"{run.config.method} on {run.config.task}, frame {run.act.frame}: mean "
         f"{evaluation.mean:.1f}, std {evaluation.std:.1f}, minimum {returns.min():.1f},"
         f" maximum {returns.max():.1f}"
     )
@@ -52,7 +53,8 @@ def main(argv: list[str]) -> None:
         if run.demonstrations.frames.ndim == 5:
             expert_frames = run.demonstrations.frames[0]
     print(line)
-    assert evaluation.video is not None
+    if evaluation.video is None:
+        return
     path = folder / "videos" / "evaluation.mp4"
     path.parent.mkdir(exist_ok=True)
     fps = run_log.frames_per_second(len(evaluation.video))
@@ -62,12 +64,7 @@ def main(argv: list[str]) -> None:
 
 def _define(values: flags.FlagValues) -> None:
     flags.DEFINE_string("workdir", None, "folder of the run", flag_values=values)
-    flags.DEFINE_string(
-        "task",
-        None,
-        "package.module:function of a run with a task of your own; its code is run",
-        flag_values=values,
-    )
+    command.define_trust(values)
     flags.DEFINE_integer(
         "num_episodes", 10, "episodes to play", 1, 100_000, flag_values=values
     )

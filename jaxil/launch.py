@@ -1,10 +1,9 @@
 r"""Trains one agent: imitation from video, or DrQ-v2 on the true reward.
 
-    python -m jaxil.launch --config=configs/pdac_walker.py --workdir=runs/pdac
-    python -m jaxil.launch --config=configs/psil.py:cheetah_run --workdir=runs/psil \
-        --config.seed=3
+    jaxil train --config=pdac:walker_walk --workdir=runs/pdac
+    jaxil train --config=psil:cheetah_run --workdir=runs/psil --config.seed=3
 
-Rerun the same command to resume.
+Rerun the same command to resume. `python -m jaxil.launch` is the same command.
 """
 
 from absl import flags
@@ -35,11 +34,11 @@ def main(argv: list[str]) -> int:
         raise UsageError(faults)
     for finding in doctor.memory(config):
         screen.say(str(finding))
+    gl_name = assembly.renderer_name(config)
+    native = agents.uses_native_convolutions(config)
+    description = provenance.describe(gl_name, native=native)
     with workdir.opened(folder):
         try:
-            gl_name = assembly.renderer_name(config)
-            native = agents.uses_native_convolutions(config)
-            description = provenance.describe(gl_name, native=native)
             workdir.write_config(folder, config, description)
             finished = train.train(config, folder)
         except (

@@ -20,6 +20,7 @@ import sys
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from jaxil import outside
 from jaxil.errors import Fault, UsageError, unknown_name
 
 _FOLDER = pathlib.Path(__file__).parent / "rewarders"
@@ -130,26 +131,44 @@ TARGETS = {
 
 
 def known() -> dict[str, Method]:
-    """Returns the methods that configs may name, by name, in the order of tables."""
-    found = {name: _declaration(ref) for name, ref in _references().items()}
+    """Returns the methods that configs may name, by name, in the order of tables.
+
+    An installed one that cannot be loaded is left out, and named on stderr once.
+    """
+    found = {}
+    for name, reference in _references().items():
+        try:
+            found[name] = _declaration(reference)
+        except UsageError as error:
+            _say_once(f"the installed method {name!r} is left out: {error}")
     return dict(sorted(found.items(), key=lambda item: (item[1].rank, item[0])))
 
 
 def get(name: str) -> Method:
-    """Returns a method.
+    """Returns a method, for which a module from outside may be imported.
 
     Args:
-      name: a key of `known()`, or "package.module:METHOD".
+      name: a key of `known()`, or "package.module:METHOD". If it comes from a file and
+        not from the user, see `is_trusted` first.
 
     Raises:
       UsageError: there is no such method.
     """
     reference = _references().get(name)
+    outside.trust(name)
     if reference is None and ":" not in name:
         raise UsageError(
             unknown_name("method", name, (*known(), "package.module:METHOD"))
         )
     return _declaration(reference or name)._replace(name=name)
+
+
+def is_trusted(name: str) -> bool:
+    """Returns whether a file may name this method.
+
+    It must be installed, or named by the user in this process: see `outside`.
+    """
+    return name in _references() or outside.is_trusted(name)
 
 
 def load(name: str, function: str) -> Any:
@@ -162,8 +181,17 @@ def load(name: str, function: str) -> Any:
 def _references() -> dict[str, str]:
     files = sorted(p for p in _FOLDER.glob("*.py") if _assignment(p, "METHOD"))
     own = {p.stem: f"jaxil.rewarders.{p.stem}:METHOD" for p in files}
-    points = importlib.metadata.entry_points(group=_ENTRY_POINTS)
-    return {**{point.name: point.value for point in points}, **own}
+    try:
+        points = importlib.metadata.entry_points(group=_ENTRY_POINTS)
+        return {**{point.name: point.value for point in points}, **own}
+    except Exception as error:  # a package's list that is damaged
+        _say_once(f"installed methods are left out, their list is damaged: {error!r}")
+        return own
+
+
+@functools.cache
+def _say_once(text: str) -> None:
+    print(text, file=sys.stderr)
 
 
 @functools.cache
@@ -171,7 +199,7 @@ def _declaration(reference: str) -> Method:
     module, _, name = reference.partition(":")
     try:
         spec = importlib.util.find_spec(module)
-    except (ImportError, ValueError):
+    except (Exception, SystemExit):  # it imports the packages around the module
         spec = None
     if spec is None or not spec.origin or not spec.origin.endswith(".py"):
         raise UsageError(
@@ -184,19 +212,20 @@ def _declaration(reference: str) -> Method:
         )
     method: Any = None
     try:
-        expression = _assignment(pathlib.Path(spec.origin), name or "METHOD")
-        if expression is not None:
-            here = sys.modules[__name__]
-            code = compile(ast.Expression(expression), spec.origin, "eval")
-            method = eval(code, {"methods": here})
-    except NameError:  # it uses names of its own file
-        pass
-    except Exception as error:  # whatever is wrong with the file
+        try:
+            expression = _assignment(pathlib.Path(spec.origin), name or "METHOD")
+            if expression is not None:
+                here = sys.modules[__name__]
+                code = compile(ast.Expression(expression), spec.origin, "eval")
+                method = eval(code, {"methods": here})
+        except NameError:  # it uses names of its own file
+            pass
+        if method is None:
+            method = getattr(importlib.import_module(module), name or "METHOD", None)
+    except (Exception, SystemExit) as error:  # whatever is wrong with the file
         raise UsageError(
-            Fault("method", f"cannot be loaded: {error}", value=reference)
+            Fault("method", f"cannot be loaded: {error!r}", value=reference)
         ) from error
-    if method is None:
-        method = getattr(importlib.import_module(module), name or "METHOD", None)
     if not isinstance(method, Method):
         raise UsageError(
             Fault(

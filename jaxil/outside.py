@@ -1,22 +1,16 @@
 """Code of the user's own, by `package.module:name`.
 
-A run's folder may come from somebody else, so what it names is imported only if the
-user has named it too: on this process's command line, or in their own config.
+A run's folder may come from somebody else, and importing a module runs it. So what a
+folder names is imported only if the user has named it in this process: in their own
+config, or with `--trust`.
 """
 
 import importlib
-import re
-import sys
 from typing import Any
 
-from jaxil.errors import Fault, UsageError
+from jaxil.errors import Fault, UsageError, printable
 
-_confirmed: set[str] = set()
-
-
-def confirm(reference: str) -> None:
-    """Lets files name this code; for programs, which have no command line of ours."""
-    _confirmed.add(reference)
+_trusted: set[str] = set()
 
 
 def load(reference: str, subject: str) -> Any:
@@ -43,8 +37,18 @@ def load(reference: str, subject: str) -> Any:
         ) from error
 
 
-def require_named(reference: str, subject: str, where: object) -> None:
-    """Refuses what a file names and the command line does not.
+def trust(reference: str) -> None:
+    """Notes that the user has named this code, so files may name it too."""
+    _trusted.add(reference)
+
+
+def is_trusted(reference: str) -> bool:
+    """Returns whether a file may name this code."""
+    return reference in _trusted
+
+
+def require_trusted(reference: str, subject: str, where: object) -> None:
+    """Refuses code that a file names and the user does not.
 
     Args:
       reference: "package.module:name", as read from the file.
@@ -52,16 +56,15 @@ def require_named(reference: str, subject: str, where: object) -> None:
       where: the file.
 
     Raises:
-      UsageError: it is not one of this command line's values.
+      UsageError: the user has not named it in this process.
     """
-    given = re.split("[=,\0]", "\0".join(sys.argv[1:]))
-    if reference not in _confirmed.union(given):
+    if not is_trusted(reference):
         raise UsageError(
             Fault(
                 subject,
-                f"stands in {where}, and is code that this command line does not name",
-                f"if you trust it, name it yourself with --{subject}={reference} "
-                "(Python: jaxil.outside.confirm)",
-                reference,
+                f"is code from outside that {where} names and you do not",
+                f"if you trust it, add --trust={printable(reference)} (in Python: "
+                "jaxil.outside.trust)",
+                printable(reference),
             )
         )

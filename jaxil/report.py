@@ -1,6 +1,6 @@
 r"""Turns folders of runs into one page with figures, tables and videos.
 
-    python -m jaxil.report RUNS... --output=report
+    jaxil report RUNS... --output=report
 
 RUNS are folders; every folder with a config.json in or below them is a run, finished or
 not. Writes report/index.html, which needs no network, report/figures (PNG and SVG) and
@@ -79,7 +79,13 @@ def _named_runs(argv: list[str]) -> list[str]:
     named, takes_value = argv[:1], False
     for word in argv[1:]:
         if word.startswith("-"):
-            takes_value = word.lstrip("-") in ("output", "seeds", "videos", "runs")
+            takes_value = word.lstrip("-") in (
+                "output",
+                "seeds",
+                "videos",
+                "runs",
+                "method",
+            )
             named.append(word)
         else:
             named.append(word if takes_value else f"--runs={word}")
@@ -100,6 +106,7 @@ def _define(values: flags.FlagValues) -> None:
         "new folder; an older report there is replaced",
         flag_values=values,
     )
+    command.define_trust(values)
     flags.DEFINE_integer(
         "seeds",
         None,

@@ -284,6 +284,7 @@ class Run(Parts):
                 "open_episodes": {n: a.tolist() for n, a in open_episodes.items()},
             },
             replay=self.replay,
+            mean_image=self.agent.mean_image,
         )
 
     def finish(self) -> None:

@@ -3,7 +3,7 @@
 import pytest
 from absl import flags
 
-from jaxil import command, launch, methods
+from jaxil import __main__, command, launch, methods
 from jaxil import config as jaxil_config
 from jaxil.errors import UsageError
 from tests.commands import ROOT
@@ -112,7 +112,7 @@ def test_help_lists_every_field_with_default_and_range(capsys):
     assert not ended.value.code
     shown = capsys.readouterr().out
     lines = [line.strip() for line in shown.splitlines()]
-    assert "python -m jaxil.launch" in shown
+    assert "jaxil train --config=" in shown
     for method in methods.known():
         assert any(line.startswith(f"of {method} (") for line in lines) == bool(
             methods.get(method).sections
@@ -124,3 +124,48 @@ def test_help_lists_every_field_with_default_and_range(capsys):
             if field.low is not None:
                 wanted += [f"{field.low:g} to {field.high:g}"]
             assert any(all(w in line for w in wanted) for line in described), name
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "configs").glob("*.py")), ids=str)
+def test_each_file_of_configs_is_a_preset_of_the_package(file):
+    # "walker" in a name is the task that the file fixes.
+    name, _, _ = file.stem.partition("_walker")
+    argument = {"tiny": ":psil,cheetah_run"}.get(name, ":cheetah_run")
+    preset = f"{name}{argument}" if name == file.stem else f"{name}:walker_walk"
+    written = f"{file}{argument}" if name == file.stem else f"{file}"
+    of_file, of_preset = (
+        command.read_config([f"--config={value}"]) for value in (written, preset)
+    )
+    assert of_file.to_dict() == of_preset.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        ("tiny:pdac", "--config='tiny:pdac' lacks the task; write METHOD,TASK"),
+        ("tiny:gail,walker_walk", "method='gail' is unknown"),
+        (
+            "pdca:walker_walk",
+            "--config='pdca' is unknown; choose one of: expert, tiny, pdac",
+        ),
+    ],
+)
+def test_a_bad_preset_is_one_sentence(value, expected):
+    (fault,) = _faults(f"--config={value}")
+    assert expected in fault
+
+
+def test_one_command_leads_to_all(capsys):
+    assert __main__.main(["jaxil"]) == 0
+    listed = capsys.readouterr().out
+    for word, tells in (("train", "--config"), ("sweep", "--methods")):
+        assert f"  {word} " in listed
+        with pytest.raises(SystemExit) as ended:
+            __main__.main(["jaxil", word, "--help"])
+        assert not ended.value.code
+        shown = capsys.readouterr().out
+        assert f"  {tells}: " in shown
+        flags_shown = [s.split(":")[0] for s in shown.splitlines() if "  --" in s]
+        assert len(flags_shown) == len(set(flags_shown))
+    with pytest.raises(UsageError, match="command='trian' is unknown"):
+        __main__.main(["jaxil", "trian"])

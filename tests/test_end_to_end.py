@@ -4,11 +4,14 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import time
 
 import numpy as np
 import pytest
 
+import jaxil
+from jaxil import export
 from jaxil.files.tables import read_csv
 from tests.commands import ROOT, arguments, run, small_run
 
@@ -43,6 +46,18 @@ def test_pdac_trains_shows_itself_and_is_evaluated_again(tmp_path):
     assert again.returncode == 0, again.stderr
     assert again.stdout.count("episode ") == 2
     assert (tmp_path / "videos" / "evaluation.mp4").stat().st_size > 1_000
+
+    policy = jaxil.load_policy(tmp_path)
+    rng = np.random.default_rng(0)
+    seen = rng.integers(0, 256, (3, *policy.observation_shape), np.uint8)
+    export.main(["export", f"--workdir={tmp_path}", f"--output={tmp_path / 'policy'}"])
+    actions = _exported(tmp_path / "policy", seen)
+    assert actions.shape == (3, 2)
+    np.testing.assert_allclose(actions, policy(seen), atol=1e-5)
+    np.testing.assert_allclose(policy(seen[1]), actions[1], atol=1e-5)
+    assert np.ptp(actions, axis=0).min() > 1e-4  # it looks at what it is shown
+    with pytest.raises(ValueError, match="expected uint8"):
+        policy(seen / 255.0)
 
     # The same command again finds nothing left to do.
     before = (tmp_path / "train.csv").read_text()
@@ -122,6 +137,25 @@ def test_state_expert_is_recorded_and_imitated(tmp_path):
         "--config.total_frames=1000",
     )
     assert imitated.returncode == 0, imitated.stderr
+    output.unlink()
+    evaluated = run("evaluate", f"--workdir={tmp_path / 'agent'}", "--num_episodes=1")
+    assert evaluated.returncode == 0, evaluated.stderr
+    assert f"without demonstrations: {output} cannot be read" in evaluated.stderr
+    assert "the expert's" not in evaluated.stdout
+
+
+def _exported(folder, observations):
+    """Acts with an exported policy, where jaxil cannot be imported."""
+    np.save(folder / "observations.npy", observations)
+    script = (
+        "import sys; sys.path.insert(0, '.'); sys.modules['jaxil'] = None\n"
+        "import numpy as np, reader\n"
+        "np.save('actions.npy', reader.act(np.load('observations.npy')))"
+    )
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-c", script]
+    subprocess.run(command, check=True, cwd=folder, env=environment, timeout=240)
+    return np.load(folder / "actions.npy")
 
 
 def test_resumes_bit_for_bit_after_a_kill(tmp_path):

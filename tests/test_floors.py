@@ -18,11 +18,13 @@ FLOORS = {
     **dict.fromkeys(("learner", "demonstrations"), 4),
     "rewarders": 5,
     "config": 6,
+    "presets": 7,
     "reporting": 7,
     "training": 8,
     "command": 9,  # checks a config as training does
     "train": 9,
     "timing": 10,
+    "sweeps": 10,
 }
 TOP = 11
 PURE = ("maths", "networks", "learner", "rewarders")

@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import json
 import os
 import pathlib
 import subprocess
@@ -13,6 +14,7 @@ from jaxil import config as jaxil_config
 from jaxil import methods
 from jaxil.errors import UsageError
 from tests.commands import ROOT, run, small_run
+from tests.reporting.run_folders import write_run
 
 _DECLARED = {
     path.stem: path
@@ -210,3 +212,94 @@ def test_what_names_no_method_is_refused(reference, words):
         methods.get(reference)
     for word in words:
         assert word in str(caught.value)
+
+
+# Named by files ----------------------------------------------------------------
+
+# A package that must not be imported, and leaves a trace if it is.
+_TRAP = """
+import pathlib
+pathlib.Path(__file__).with_name("sprung").touch()
+"""
+
+
+@pytest.fixture
+def trap(package, tmp_path) -> pathlib.Path:
+    """A run's folder whose config names a module in that package."""
+    (package / "trap").mkdir()
+    (package / "trap" / "__init__.py").write_text(_TRAP)
+    (package / "trap" / "inner.py").write_text(_BRIGHT)
+    folder = write_run(tmp_path / "run", "zero", "walker_walk", 0, {1000: 10})
+    stored = json.loads((folder / "config.json").read_text())
+    stored["config"]["method"] = "trap.inner:METHOD"
+    (folder / "config.json").write_text(json.dumps(stored))
+    return folder
+
+
+def _was_sprung(package) -> bool:
+    return (package / "trap" / "sprung").exists()
+
+
+def test_reading_a_folder_imports_no_module_that_it_names(package, trap):
+    printed = python(
+        "import pathlib\n"
+        "from jaxil.errors import UsageError\n"
+        "from jaxil.reporting import runs\n"
+        "from jaxil.training import workdir\n"
+        f"folder = pathlib.Path({str(trap)!r})\n"
+        "print(runs.read(folder).remarks)\n"
+        "print(runs.read(folder).variant.label)\n"
+        "try: workdir.read_config(folder)\n"
+        "except UsageError as error: print(error)\n"
+    )
+    remarks, label, refusal = printed.splitlines()
+    assert "'trap.inner:METHOD' is not installed here" in remarks
+    assert label == "trap.inner:METHOD"
+    assert "method='trap.inner:METHOD' is code from outside" in refusal
+    assert "--trust=trap.inner:METHOD" in refusal
+    assert not _was_sprung(package)
+
+
+def test_a_command_imports_a_module_that_the_user_names(package, trap, tmp_path):
+    output = tmp_path / "report"
+    finished = run("evaluate", f"--workdir={trap}")
+    assert finished.returncode == 2
+    assert "is code from outside" in finished.stderr
+    assert "Traceback" not in finished.stderr
+    assert not _was_sprung(package)
+    words = (str(trap), "--trust", "trap.inner:METHOD", f"--output={output}")
+    finished = run("report", *words)
+    assert finished.returncode == 0, finished.stderr
+    assert "Bright" in (output / "index.html").read_text()
+    assert _was_sprung(package)
+
+
+def test_a_broken_installed_method_is_named_and_the_others_work(package):
+    information = package / "broken-1.0.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text("Name: broken\nVersion: 1.0\n")
+    (package / "broken.py").write_text("import sys\nMETHOD = sys.exit(3)\n")
+    (information / "entry_points.txt").write_text(
+        "[jaxil.methods]\n"
+        "gone = no_such_module:METHOD\n"
+        "broken = broken:METHOD\n"
+        "bright = my_method:METHOD\n"
+    )
+    printed = python(
+        "import contextlib, io\n"
+        "from jaxil import methods\n"
+        "from jaxil.errors import UsageError\n"
+        "with contextlib.redirect_stderr(io.StringIO()) as said:\n"
+        "    names = [*methods.known(), *methods.known()]\n"
+        "    try: methods.get('broken')\n"
+        "    except UsageError as error: print(error, file=said)\n"
+        "print((names, said.getvalue()))\n"
+    )
+    names, said = ast.literal_eval(printed)
+    assert names.count("bright") == names.count("pdac") == 2
+    assert not {"gone", "broken"} & set(names)
+    left_out, also_left_out, refused = said.splitlines()
+    assert "'gone' is left out" in left_out
+    assert "'no_such_module'" in left_out
+    assert "'broken' is left out" in also_left_out
+    assert "cannot be loaded: SystemExit(3)" in refused

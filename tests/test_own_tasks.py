@@ -7,7 +7,7 @@ import textwrap
 import numpy as np
 import pytest
 
-from jaxil import collect
+from jaxil import collect, outside
 from jaxil.config import default_config
 from jaxil.demonstrations import foreign, states
 from jaxil.errors import UsageError
@@ -142,8 +142,8 @@ def test_a_task_from_outside_is_recorded_trained_resumed_and_shown(
         assert evaluated.returncode == 0, evaluated.stderr
     else:  # the folder alone may not make Python import anything
         assert evaluated.returncode == 2
-        assert f"--task={task}" in evaluated.stderr
-        trusted = (f"--workdir={workdir}", "--num_episodes=1", f"--task={task}")
+        assert f"--trust={task}" in evaluated.stderr
+        trusted = (f"--workdir={workdir}", "--num_episodes=1", f"--trust={task}")
         evaluated = run("evaluate", *trusted)
         assert evaluated.returncode == 0, evaluated.stderr
     assert "the expert's mean" in evaluated.stdout
@@ -168,19 +168,19 @@ def test_faults_of_tasks_are_one_message_each(tmp_path):
 
 
 @pytest.mark.parametrize("task", ["harm:make", "gymnasium:harm:Harm-v0"])
-def test_a_folder_or_file_alone_makes_python_import_nothing(
-    task, tmp_path, monkeypatch
-):
+def test_a_folder_or_file_alone_makes_python_import_nothing(task, tmp_path):
     (tmp_path / "harm.py").write_text("raise SystemExit('imported')")
-    workdir.write_config(tmp_path, default_config("zero", task), {})
-    with pytest.raises(UsageError, match=f"--task={task}"):
+    config = default_config("zero")
+    config.task = task
+    workdir.write_config(tmp_path, config, {})
+    with pytest.raises(UsageError, match=f"--trust={task}"):
         workdir.read_config(tmp_path)
     stored = states.read_states(states.shipped_path("cartpole_swingup"), num_episodes=1)
     stored = stored._replace(metadata={**stored.metadata, "task": task})
     states.write_states(tmp_path / "states.npz", stored)
-    with pytest.raises(UsageError, match=f"--task={task}"):
+    with pytest.raises(UsageError, match=f"--trust={task}"):
         collect.main(["collect", f"--inspect={tmp_path / 'states.npz'}"])
-    monkeypatch.setattr("sys.argv", ["jaxil", f"--task={task}"])
+    outside.trust(task)
     assert workdir.read_config(tmp_path).task == task
 
 

@@ -157,7 +157,7 @@ def test_what_is_missing_of_the_papers_figures(folder):
     # two that differ in batch size have the same seed.
     assert "6 of\n160 runs are finished" in text
     assert (
-        "python launch/sweep.py --ablation=figure6 --tasks=cartpole_swingup,"
+        "jaxil sweep --ablation=figure6 --tasks=cartpole_swingup,"
         "finger_spin,ball_in_cup_catch,acrobot_swingup,cheetah_run,walker_stand,"
         "walker_walk,walker_run --seeds=4 --workdir=DIR" in text
     )

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from jaxil.files.tables import read_csv
-from launch.sweeps import clusters, state
-from launch.sweeps.state import State
+from jaxil.sweeps import clusters, state
+from jaxil.sweeps.state import State
 from tests.commands import ROOT, SMALL
 from tests.trainer import FRAMES, stand_in
 

@@ -13,10 +13,10 @@ import pytest
 from jaxil.errors import Fault, UsageError
 from jaxil.files import locking
 from jaxil.files.tables import read_csv
+from jaxil.sweeps import clusters, plan, state, tables
+from jaxil.sweeps.clusters import Cluster
+from jaxil.sweeps.state import State, Status
 from jaxil.training import workdir
-from launch.sweeps import clusters, plan, state, tables
-from launch.sweeps.clusters import Cluster
-from launch.sweeps.state import State, Status
 from tests.commands import ROOT, SMALL
 from tests.trainer import FRAMES, stand_in
 
@@ -202,7 +202,7 @@ def test_clusters_that_are_not_there(monkeypatch):
     monkeypatch.setattr(clusters.importlib.util, "find_spec", lambda name: None)
     many = Cluster("slurm", num_workers=10**6, hours=0.0, num_gpus=2, num_cpus=0)
     told = "\n".join(map(str, clusters.problems(many, starts=True)))
-    for words in ("no Slurm here", "jaxil[cluster]", "--workers=", "--hours=0.0",
+    for words in ("no Slurm here", "pip install submitit", "--workers=", "--hours=0.0",
                   "--gpus=2", "--cpus=0"):  # fmt: skip
         assert words in told
     assert not list(clusters.problems(Cluster("slurm"), starts=False))
@@ -473,7 +473,7 @@ def test_real_runs_from_the_plan_to_the_table(tmp_path):
     planned = _sweep(*flags, "--dry_run")
     assert planned.returncode == 0, planned.stderr
     assert "1 missing" in planned.stdout
-    assert "jaxil.launch --config=configs/tiny.py:drqv2,ball_in" in planned.stdout
+    assert "jaxil.launch --config=tiny:drqv2,ball_in" in planned.stdout
     assert not list(tmp_path.iterdir())
     done = _sweep(*flags)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -490,7 +490,7 @@ def test_real_runs_from_the_plan_to_the_table(tmp_path):
 
 def _sweep(*flags: str):
     return subprocess.run(
-        [sys.executable, "launch/sweep.py", *flags],
+        [sys.executable, "-m", "jaxil.sweep", *flags],
         cwd=ROOT,
         env={**os.environ, "JAX_PLATFORMS": "cpu"},
         capture_output=True,
@@ -504,7 +504,7 @@ def _quick(folder, name):
 
 _SWEEP = """
 import pathlib, pickle, signal, sys
-from launch.sweeps import clusters
+from jaxil.sweeps import clusters
 def stop(number, frame):
     raise KeyboardInterrupt
 signal.signal(signal.SIGTERM, stop)

@@ -15,8 +15,8 @@ from jaxil.config import default_config
 from jaxil.errors import UsageError
 from jaxil.files.tables import CsvLog
 from jaxil.machine.signals import StopOnSignals
+from jaxil.sweeps.state import Run
 from jaxil.training import workdir
-from launch.sweeps.state import Run
 
 FRAMES = 1000  # of an episode
 _EVERY = 5  # episodes from checkpoint to checkpoint

@@ -26,7 +26,8 @@ from jaxil.demonstrations.readers.recording import (
     checked,
 )
 from jaxil.demonstrations.readers.sandbox import read_in_child
-from jaxil.files.untrusted import printable, require_regular
+from jaxil.errors import printable
+from jaxil.files.untrusted import require_regular
 
 # The first that recognises a file reads it. Datasets may contain videos, and folders
 # of videos pictures.

@@ -1,6 +1,7 @@
 """Loads demonstrations of any format as the agent observes them, and samples them."""
 
 import functools
+import hashlib
 import os
 import pathlib
 from collections.abc import Callable
@@ -104,13 +105,13 @@ def check(
 
 
 def load(
-    source: str | os.PathLike,
+    source: str | os.PathLike = "",
     *,
     task: str,
-    num_episodes: int,
-    action_repeat: int,
-    image_size: int,
-    render_quality: str,
+    num_episodes: int = 10,
+    action_repeat: int = 2,
+    image_size: int = 84,
+    render_quality: str = "paper",
     observation: str = "pixels",
     camera: str = "",
     distraction: str = "none",
@@ -254,8 +255,31 @@ def sample_indices(
     return ExpertBatch(stacks(steps), actions, successor)
 
 
+def digest(source: str | os.PathLike, task: str) -> str:
+    """Returns a digest of a source's content, which does not depend on its path.
+
+    Raises:
+      DemonstrationError: it cannot be read.
+    """
+    path = _path_of(source, task)
+    total = hashlib.blake2b(digest_size=16)
+    try:
+        parts = sorted(path.rglob("*")) if path.is_dir() else [path]
+        for part in parts:
+            if part.is_file():
+                with part.open("rb") as file:
+                    one = hashlib.file_digest(file, "blake2b")
+                name = "" if part == path else part.relative_to(path).as_posix()
+                total.update(f"{name} {one.hexdigest()}\n".encode())
+    except OSError as error:
+        raise unreadable(path, error) from error
+    return total.hexdigest()
+
+
 def _path_of(source: str | os.PathLike, task: str) -> pathlib.Path:
-    return pathlib.Path(source) if str(source) else states.shipped_path(task)
+    if not str(source):
+        return states.shipped_path(task)
+    return pathlib.Path(source).expanduser()
 
 
 def _returns(task_rewards: np.ndarray | None) -> list[float]:

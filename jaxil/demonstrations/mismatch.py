@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxil.environments import suite, tasks
+from jaxil.errors import printable
 
 _RATE_TOLERANCE = 0.1  # relative, of a video's frame rate
 _LARGEST_ACTION = 1.001  # beyond rounding
@@ -72,7 +73,7 @@ def warn_of_pixels(
         )
     messages += [f"{path}: {note}" for note in metadata["notes"]]
     for message in messages:
-        _logger.warning("%s", message)
+        _logger.warning("%s", printable(message))
 
 
 def warn_of_expert(
@@ -107,7 +108,7 @@ def warn_of_expert(
     if rewards is not None and not rewards.any():
         messages.append("shows an expert whose task return is 0.")
     for message in messages:
-        _logger.warning("%s %s", path, message)
+        _logger.warning("%s", printable(f"{path} {message}"))
 
 
 def warn_of_versions(path: pathlib.Path, recorded: dict[str, str]) -> None:
@@ -120,6 +121,6 @@ def warn_of_versions(path: pathlib.Path, recorded: dict[str, str]) -> None:
     if differing:
         _logger.warning(
             "%s was recorded with %s: motion and appearance may differ slightly.",
-            path,
-            ", ".join(differing),
+            printable(path),
+            printable(", ".join(differing)),
         )

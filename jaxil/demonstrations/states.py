@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxil.environments import suite
+from jaxil.errors import printable
 from jaxil.files import archive
 
 FORMAT = "jaxil-demonstrations"
@@ -192,7 +193,7 @@ def _shipped_folder() -> pathlib.Path:
 
 def fault(path: pathlib.Path, what: str, way_out: str = _REMAKE) -> DemonstrationError:
     """Returns the error for a file, with a remedy."""
-    return DemonstrationError(f"{path} {what}. {way_out}.")
+    return DemonstrationError(f"{printable(path)} {printable(what)}. {way_out}.")
 
 
 def other_task(path: pathlib.Path, shown: str, task: str) -> DemonstrationError:

@@ -86,9 +86,9 @@ class Renderer:
                 self._camera = self._open_camera(
                     self._physics, self._size, self._camera_index
                 )
-            except (RuntimeError, ImportError) as error:
+            except Exception as error:  # MuJoCo's and GLFW's are of no common type
                 raise RuntimeError(
-                    f"rendering is not available: {error} "
-                    "`python -m jaxil.doctor` says what to install."
+                    f"rendering is not available: {error}; "
+                    "`python -m jaxil.doctor` says what to install"
                 ) from error
         return self._camera

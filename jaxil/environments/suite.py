@@ -1,12 +1,12 @@
 """Makes environments of the DeepMind Control Suite.
 
-No other module imports dm_control. Call `jaxil.machine.startup.prepare` first, because
-dm_control chooses the GL backend when it is imported.
+No other module imports dm_control.
 """
 
 import difflib
 import functools
 import importlib.metadata
+import os
 from typing import Any
 
 import dm_env
@@ -15,16 +15,40 @@ import numpy as np
 from jaxil.environments.camera import RENDER_QUALITIES, Renderer
 from jaxil.environments.distraction import STRENGTHS, Distraction
 from jaxil.environments.pixel_environment import PixelEnvironment, flat_state
+from jaxil.machine import startup
 
 OBSERVATIONS = ("pixels", "state")
 
 
 @functools.cache
+def _suite() -> Any:
+    """Imports dm_control's suite, which chooses the GL backend for good.
+
+    A backend that is not available is replaced by none, since states need no images.
+    """
+    startup.choose_gl()
+    backend = os.environ["MUJOCO_GL"]
+    try:
+        if backend == "glfw" and not {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
+            raise RuntimeError("there is no display")
+        from dm_control import suite
+    except (ImportError, RuntimeError, AttributeError) as error:
+        _missing_gl.append(
+            f"MUJOCO_GL={backend} does not work here ({error}): unset it"
+        )
+        os.environ["MUJOCO_GL"] = "disable"
+        from dm_control import suite
+    return suite
+
+
+# Why the backend that the user chose is not used.
+_missing_gl: list[str] = []
+
+
+@functools.cache
 def known_tasks() -> tuple[str, ...]:
     """Returns all tasks of the suite as `domain_task`, sorted."""
-    from dm_control import suite
-
-    return tuple(sorted(f"{domain}_{name}" for domain, name in suite.ALL_TASKS))
+    return tuple(sorted(f"{domain}_{name}" for domain, name in _suite().ALL_TASKS))
 
 
 def split_task(task: str) -> tuple[str, str]:
@@ -33,9 +57,7 @@ def split_task(task: str) -> tuple[str, str]:
     Raises:
       ValueError: unknown task; names similar ones.
     """
-    from dm_control import suite
-
-    for domain, name in suite.ALL_TASKS:
+    for domain, name in _suite().ALL_TASKS:
         if task == f"{domain}_{name}":
             return domain, name
     close = difflib.get_close_matches(task, known_tasks(), n=3, cutoff=0.5)
@@ -201,9 +223,7 @@ def make_environment(
         if value not in known:
             names = ", ".join(known)
             raise ValueError(f"{name}={value!r} is unknown; choose one of: {names}.")
-    from dm_control import suite
-
-    simulator = suite.load(*split_task(task), task_kwargs={"random": seed})
+    simulator = _suite().load(*split_task(task), task_kwargs={"random": seed})
     return wrap(
         simulator,
         default_camera=camera_of(task),
@@ -246,4 +266,6 @@ def camera_index(model: Any, camera: str, default: int = 0) -> int:
 def _open_camera(physics: Any, size: int, index: int) -> Any:
     from dm_control.mujoco import engine
 
+    if _missing_gl:
+        raise RuntimeError(_missing_gl[0])
     return engine.Camera(physics, height=size, width=size, camera_id=index)

@@ -7,11 +7,19 @@ import json
 import os
 import pathlib
 import platform
+import threading
 import time
 from collections.abc import Iterator
 
+from jaxil.errors import printable
+from jaxil.files.untrusted import read_regular
+
 # Reported by file systems without locks (some NFS and Lustre mounts).
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+_HEARTBEAT_SECONDS = 60.0
+# Without a heartbeat for so long, an owner elsewhere is dead; clocks of machines that
+# share a file system may differ by less.
+_DEAD_SECONDS = 600.0
 
 
 class InUseError(Exception):
@@ -23,10 +31,16 @@ def locked(path: pathlib.Path) -> Iterator[None]:
     """Holds the lock on a file, creating the file if it is missing.
 
     Without file-system locks, PATH.owner replaces the lock: a file, created
-    exclusively, of host, process id and time. It is taken over if its process has ended
-    on this host. Raises InUseError if another process holds the lock.
+    exclusively, that describes the process and is touched every minute. It is taken
+    over once its process is known to have ended: on the same machine since the same
+    start, the process table says so; elsewhere, ten minutes without a touch do.
+
+    Raises:
+      InUseError: another process holds the lock.
     """
-    with path.open("a") as file:
+    # Not `open`, which would wait for a reader if someone has put a pipe there.
+    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK
+    with os.fdopen(os.open(path, flags, 0o666), "a") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -34,12 +48,8 @@ def locked(path: pathlib.Path) -> Iterator[None]:
         except OSError as error:
             if error.errno not in _NO_LOCKS:
                 raise
-            owner = path.with_name(f"{path.name}.owner")
-            _own(owner)
-            try:
+            with _owned(path.with_name(f"{path.name}.owner")):
                 yield
-            finally:
-                owner.unlink(missing_ok=True)
             return
         yield
 
@@ -47,7 +57,7 @@ def locked(path: pathlib.Path) -> Iterator[None]:
 def is_locked(path: pathlib.Path) -> bool:
     """Returns whether another process holds the lock on a file."""
     try:
-        with path.open() as file:
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK)) as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
@@ -58,29 +68,64 @@ def is_locked(path: pathlib.Path) -> bool:
     return False
 
 
-def _own(path: pathlib.Path) -> None:
+@contextlib.contextmanager
+def _owned(path: pathlib.Path) -> Iterator[None]:
     if _owner(path) is None:
         path.unlink(missing_ok=True)
     try:
         with path.open("x") as file:
-            json.dump([platform.node(), os.getpid(), time.strftime("%F %T")], file)
+            since = time.strftime("%F %T")
+            json.dump([*_machine(), os.getpid(), _start(os.getpid()), since], file)
     except FileExistsError as error:
         raise InUseError(
             f"in use by {_owner(path) or 'another process'} (if that has ended, "
             f"delete {path})"
         ) from error
+    ended = threading.Event()
+
+    def touch() -> None:
+        while not ended.wait(_HEARTBEAT_SECONDS):
+            with contextlib.suppress(OSError):
+                os.utime(path)
+
+    threading.Thread(target=touch, daemon=True).start()
+    try:
+        yield
+    finally:
+        ended.set()
+        path.unlink(missing_ok=True)
 
 
 def _owner(path: pathlib.Path) -> str | None:
     """Describes the owner; None if there is none, or if it has ended."""
+    is_old = False
     try:
-        host, process, since = json.loads(path.read_text())
-        if host == platform.node():
-            os.kill(int(process), 0)
-    except (FileNotFoundError, ProcessLookupError):
+        is_old = time.time() - path.stat().st_mtime > _DEAD_SECONDS
+        *machine, process, start, since = json.loads(read_regular(path))
+        if machine == _machine():
+            is_old = _start(int(process)) != start
+        name = f"process {process} on {machine[0]} since {since}"
+    except FileNotFoundError:
         return None
-    except PermissionError:  # running, as another user
-        pass
-    except (OSError, ValueError, TypeError, OverflowError, RecursionError):
-        return "an unknown process"
-    return f"process {process} on {host} since {since}"
+    except (OSError, ValueError, TypeError, IndexError, RecursionError):
+        name = "an unknown process"
+        if not path.is_file():
+            return name
+    return None if is_old else printable(name, 200)
+
+
+def _machine() -> list[str]:
+    """Returns what tells apart machines, their restarts, and containers there."""
+    boot = pathlib.Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    return [platform.node(), boot, str(pathlib.Path("/proc/self/ns/pid").readlink())]
+
+
+def _start(process: int) -> str | None:
+    """Returns when a process has begun, in ticks; None if it has ended."""
+    try:
+        stat = pathlib.Path(f"/proc/{process}/stat").read_text()
+    except OSError:
+        return None
+    # After the name in brackets: the state, and 18 numbers.
+    state, *numbers = stat.rpartition(")")[2].split()
+    return None if state in "ZX" else numbers[18]

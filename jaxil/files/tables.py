@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxil.files import writing
+from jaxil.files import untrusted, writing
 
 
 class CsvLog:
@@ -41,7 +41,7 @@ class CsvLog:
             try:
                 rows = _read(self._path)[1]
                 rows = [row for row in rows if float(row["frame"]) <= resume_frame]
-            except (ValueError, IsADirectoryError) as error:
+            except (ValueError, OSError) as error:
                 aside = _set_aside(self._path)
                 rows = []
                 say(f"{error}; kept as {aside.name}, {self._path.name} starts empty")
@@ -93,7 +93,7 @@ def read_csv(path: str | os.PathLike) -> dict[str, np.ndarray]:
 
 def _read(path: pathlib.Path) -> tuple[list[str], list[dict[str, str]]]:
     """Returns the names of the columns, and the rows."""
-    content = path.read_bytes()
+    content = untrusted.read_regular(path)
     try:
         # A kill in mid-write leaves a last line without an end.
         text = content[: content.rfind(b"\n") + 1].decode()

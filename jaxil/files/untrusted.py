@@ -1,8 +1,36 @@
-"""Untrusted files: what may be opened, and how their text is printed."""
+"""Untrusted files: what may be opened, and how much of it is read."""
 
+import errno
 import os
 import pathlib
 import stat
+from typing import BinaryIO
+
+_MAX_BYTES = 2**28  # of a file that is read at once
+
+
+def open_regular(path: str | os.PathLike) -> BinaryIO:
+    """Opens a file for reading; raises OSError for pipes and devices at once."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    mode = os.fstat(descriptor).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(descriptor)
+        number = errno.EISDIR if stat.S_ISDIR(mode) else errno.ENOTSUP
+        raise OSError(number, "not a regular file", str(path))
+    return os.fdopen(descriptor, "rb")
+
+
+def read_regular(path: str | os.PathLike, max_bytes: int = _MAX_BYTES) -> bytes:
+    """Returns a file's content.
+
+    Raises:
+      OSError: it cannot be opened, or is a pipe or device.
+      ValueError: it is larger than `max_bytes`.
+    """
+    with open_regular(path) as file:
+        if os.fstat(file.fileno()).st_size > max_bytes:
+            raise ValueError(f"{path}: expected at most {max_bytes} bytes")
+        return file.read()
 
 
 def require_regular(path: str | os.PathLike, *, or_folder: bool = False) -> None:
@@ -15,10 +43,3 @@ def require_regular(path: str | os.PathLike, *, or_folder: bool = False) -> None
     if not stat.S_ISREG(mode) and not (or_folder and stat.S_ISDIR(mode)):
         kind = "folder" if stat.S_ISDIR(mode) else "pipe, device or socket"
         raise ValueError(f"is a {kind}, not a regular file")
-
-
-def printable(text: object, max_letters: int = 1000) -> str:
-    """Returns text on one line, without control characters and of bounded length."""
-    letters = " ".join(str(text)[: 2 * max_letters].split())
-    shown = "".join(letter if letter.isprintable() else "?" for letter in letters)
-    return shown if len(shown) <= max_letters else f"{shown[: max_letters - 3]}..."

@@ -11,6 +11,8 @@ import pathlib
 import platform
 from typing import Any
 
+from jaxil.errors import Fault, UsageError
+
 
 def has_cuda_device() -> bool:
     """Returns whether CUDA can see an NVIDIA device."""
@@ -52,10 +54,21 @@ def instruction_set() -> str:
 
 
 def device_name() -> str:
-    """Returns what jax computes on, such as "gpu: NVIDIA H100"."""
+    """Returns what jax computes on, such as "gpu: NVIDIA H100".
+
+    Raises:
+      UsageError: JAX_PLATFORMS names what this machine lacks.
+    """
     import jax
 
-    device = jax.devices()[0]
+    try:
+        device = jax.devices()[0]
+    except (RuntimeError, AssertionError) as error:  # the latter without a reason
+        platforms = os.environ.get("JAX_PLATFORMS", "")
+        reason = str(error).splitlines()[0] if str(error) else "no such device"
+        way_out = "unset it; `python -m jaxil.doctor` says what to install"
+        rule = f"is not available here: {reason}"
+        raise UsageError(Fault("JAX_PLATFORMS", rule, way_out, platforms)) from error
     return f"{device.platform}: {device.device_kind}"
 
 

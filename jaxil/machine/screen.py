@@ -4,6 +4,10 @@ import os
 import sys
 from typing import TextIO
 
+from jaxil.errors import printable
+
+_MAX_LETTERS = 4000  # of a line
+
 
 class LastingStream:
     """A text stream that discards its input, instead of failing, once it is closed.
@@ -37,8 +41,9 @@ class LastingStream:
 
 
 def say(text: str) -> None:
-    """Writes a line on stderr."""
-    LastingStream().write(f"{text}\n")
+    """Writes lines on stderr, without control characters that a file may contain."""
+    lines = [printable(line, _MAX_LETTERS) for line in text.split("\n")]
+    LastingStream().write("\n".join([*lines, ""]))
 
 
 def _give_up(stream: TextIO | None) -> None:

@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 
+from jaxil.errors import UsageError, unknown_name
 from jaxil.machine import devices
 from jaxil.machine.cache import compilation_folder
 
@@ -31,6 +32,11 @@ with context.make_current() as current:
 os._exit(0)
 """
 _GL_PROBE_SECONDS = 15.0
+# As dm_control spells them.
+_GL_BACKENDS = (
+    *("", "glfw", "on", "enable", "enabled", "true", "1", "egl", "osmesa"),
+    *("disable", "disabled", "off", "false", "0"),
+)
 _GL_PROBE_TRIES = 2  # some drivers hang once in hundreds of tries
 # Options of glibc's malloc.h that keep freed memory in the process: all blocks come
 # from one heap, which is never trimmed.
@@ -52,7 +58,7 @@ def prepare() -> str:
     cpu = devices.uses_cpu()
     if cpu:
         _keep_freed_memory()
-    parts = [f"jax on {'CPU' if cpu else 'an accelerator'}", _choose_gl()]
+    parts = [f"jax on {'CPU' if cpu else 'an accelerator'}", choose_gl()]
     if cpu and devices.version("jaxlib") in _JAXLIBS_WITH_YNN_FUSION:
         flags = os.environ.get("XLA_FLAGS", "")
         if _NO_YNN_FUSION not in flags:
@@ -88,10 +94,17 @@ def gl_works(backend: str) -> bool:
     return False
 
 
-def _choose_gl() -> str:
-    """Sets MUJOCO_GL if it is unset; returns a few words about it."""
+def choose_gl() -> str:
+    """Sets MUJOCO_GL if it is unset; returns a few words about it.
+
+    Raises:
+      UsageError: it is set to what no backend is called.
+    """
     chosen = os.environ.get("MUJOCO_GL")
     if chosen is not None:
+        if chosen not in _GL_BACKENDS:
+            known = ("egl", "osmesa", "glfw", "disable")
+            raise UsageError(unknown_name("MUJOCO_GL", chosen, known))
         return f"GL {chosen or 'glfw'} (MUJOCO_GL)"
     for backend in ("egl", "osmesa"):
         if gl_works(backend):

@@ -6,6 +6,7 @@ import zipfile
 
 import numpy as np
 
+from jaxil.errors import printable
 from jaxil.files import archive, writing
 from jaxil.maths.types import Episode
 from jaxil.replay.replay import Replay
@@ -51,7 +52,7 @@ def read_into(replay: Replay, folder: pathlib.Path, index: int) -> str | None:
     except (OSError, ValueError) as error:
         replay.skip_episode()
         reason = error.strerror if isinstance(error, OSError) else error
-        return f"{path.name}: {str(reason).splitlines()[0][:160]}"
+        return f"{path.name}: {printable(reason, 160)}"
     return None
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxil.files import archive
+from jaxil.files import archive, untrusted
 from jaxil.reporting import plots
 from jaxil.reporting.groups import Group
 from jaxil.reporting.runs import LARGEST, Run, printable
@@ -100,7 +100,7 @@ def _video(path: pathlib.Path, room: int) -> bytes:
       OSError: it cannot be read.
       ValueError: says what else is wrong with it.
     """
-    with archive.open_regular(path) as file:
+    with untrusted.open_regular(path) as file:
         video = file.read(_MAX_BYTES_EACH + 1)
     if len(video) > _MAX_BYTES_EACH:
         raise ValueError(f"it has more than {_MAX_BYTES_EACH // 10**6} MB")

@@ -49,7 +49,7 @@ def _figure(groups: list[Group], figure: Figure, num_seeds: int) -> PaperFigure:
         if min(counts) < num_seeds:
             missing.append(task)
     command = (
-        f"python launch/sweep.py --ablation=figure{figure.number} "
+        f"jaxil sweep --ablation=figure{figure.number} "
         f"--tasks={','.join(missing)} --seeds={num_seeds} --workdir=DIR"
     )
     # An ablation of which only the plain method has run shows nothing.

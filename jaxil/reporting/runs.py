@@ -10,15 +10,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxil import config as jaxil_config
-from jaxil import methods
-from jaxil.files import archive, tables
+from jaxil import errors, methods
+from jaxil.files import tables, untrusted
 from jaxil.files.settings import as_stored, flat
 from jaxil.reporting import figures
 
 # Large folders of a run, in which there are no other runs.
 _OWN_FOLDERS = ("checkpoints", "replay", "tensorboard", "videos")
 _RETURN = "task_return_mean"
-_FAILED = "failed.json"  # of launch/sweep.py
+_FAILED = "failed.json"  # of `jaxil sweep`
 # What every run writes; without it a file is damaged.
 _NEEDED = {"method": str, "task": str, "seed": int, "total_frames": int}
 # Beyond any true setting, return or time; sums of larger ones would overflow.
@@ -181,14 +181,13 @@ def defaults_of(method: str, task: str) -> dict[str, Any]:
 
 
 def printable(path: pathlib.Path) -> str:
-    """Returns a path as text that any file can hold."""
-    return path.as_posix().encode(errors="replace").decode()
+    """Returns a path as text that any file can hold and any terminal can show."""
+    return errors.printable(path.as_posix().encode(errors="replace").decode(), 4000)
 
 
 def _read_config(path: pathlib.Path) -> dict[str, Any]:
     try:
-        with archive.open_regular(path) as file:
-            stored = json.loads(file.read(_MAX_CONFIG_BYTES))
+        stored = json.loads(untrusted.read_regular(path, _MAX_CONFIG_BYTES))
         # Lone surrogates, which no file can hold, and nesting too deep to walk.
         json.dumps(stored, ensure_ascii=False).encode()
     except OSError as error:
@@ -212,8 +211,8 @@ def _read_config(path: pathlib.Path) -> dict[str, Any]:
 
 def _exit_status(folder: pathlib.Path) -> str:
     try:
-        with archive.open_regular(folder / _FAILED) as file:
-            status = int(json.loads(file.read(_MAX_CONFIG_BYTES))["exit_status"])
+        content = untrusted.read_regular(folder / _FAILED, _MAX_CONFIG_BYTES)
+        status = int(json.loads(content)["exit_status"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return "exit status unknown"
     return f"exit status {status}"
@@ -252,7 +251,6 @@ def _read_table(
     columns = ["frame", *([needed] if needed else [])]
     empty = {column: np.zeros(0) for column in columns}
     try:
-        archive.open_regular(path).close()
         table = tables.read_csv(path)
         missing = [column for column in columns if column not in table]
         if missing:

@@ -1,13 +1,13 @@
 """Tables of results: one measurement, a comparison, or a sweep."""
 
 import json
-import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from flax.traverse_util import flatten_dict
 
-from jaxil.errors import UsageError
+from jaxil.errors import UsageError, printable
+from jaxil.files.untrusted import read_regular
 
 # The meaning of each row, by section.
 ROWS: dict[str, dict[str, str]] = {
@@ -90,7 +90,7 @@ def sweep_table(all_results: Sequence[Mapping[str, Any]]) -> str:
 def read(path: str) -> dict[str, Any]:
     """Reads results that `--json` wrote; UsageError if the file has none."""
     try:
-        results = json.loads(pathlib.Path(path).read_text())
+        results = json.loads(read_regular(path))
         if not all(isinstance(results[name], kind) for name, kind in _ALWAYS.items()):
             raise ValueError("its values are of other types")
     except (OSError, ValueError, LookupError, TypeError) as error:
@@ -123,7 +123,7 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     for name in dict.fromkeys([*before, *now]):
         then, here = (repr(e[name]) if name in e else "absent" for e in (before, now))
         if then != here:
-            found.append(f"{name}: {then} then, {here} now")
+            found.append(printable(f"{name}: {then} then, {here} now"))
     return found
 
 

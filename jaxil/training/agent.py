@@ -43,6 +43,8 @@ class Agent(NamedTuple):
       refresh: rewards of stored episodes as of now, see `rewarder.make_refresh`.
       plan: the rewarder's; None where it has none.
       rewarder: the method itself.
+      mean_image: what the encoder subtracts, where that is the demonstrations' mean
+        image; None otherwise.
       init_state: () -> the state before the first update.
     """
 
@@ -55,6 +57,7 @@ class Agent(NamedTuple):
     refresh: Any
     plan: Any
     rewarder: Rewarder
+    mean_image: np.ndarray | None
     init_state: Any
 
 
@@ -171,7 +174,8 @@ def make_agent(
       demonstrations: what the method imitates, or None.
     """
     action_dim = environment.action_spec().shape[0]
-    networks = make_networks(config, action_dim, mean_image(config, demonstrations))
+    mean = mean_image(config, demonstrations)
+    networks = make_networks(config, action_dim, mean)
     rewarder = make_rewarder(config, networks)
     schedule = exploration_schedule(config)
     first_update = config.seed_frames // config.action_repeat
@@ -215,6 +219,7 @@ def make_agent(
         refresh=jax.jit(make_refresh(rewarder)),
         plan=None if rewarder.plan is None else jax.jit(rewarder.plan),
         rewarder=rewarder,
+        mean_image=mean if isinstance(mean, np.ndarray) else None,
         # Compiled, and kept in the cache: one by one, its 450 operations take longer.
         init_state=jax.jit(
             lambda: init_train_state(

@@ -17,7 +17,7 @@ from jaxil.environments.player import InProcess, Player
 from jaxil.environments.pool import Pool
 from jaxil.environments.suite import known_tasks
 from jaxil.environments.tasks import make_environment
-from jaxil.errors import Fault
+from jaxil.errors import Fault, UsageError
 from jaxil.machine import memory
 from jaxil.machine.progress import ProgressLine
 from jaxil.native import build
@@ -81,15 +81,21 @@ def demonstration_fault(config: Config) -> str | None:
 
 
 def renderer_name(config: Config) -> str:
-    """Returns what GL calls the device that will draw this run's pixels.
+    """Returns what GL calls the device that renders here; "none" if it is not needed.
 
     Raises:
-      RuntimeError: nothing here can render.
+      UsageError: nothing here can render, but the run needs it.
     """
-    environment = training_environment(config)
-    name = environment.renderer_name()
-    environment.close()
-    return name
+    with training_environment(config) as environment:
+        try:
+            return environment.renderer_name()
+        except RuntimeError as error:
+            if config.observation == "state" and not config.video_every_evals:
+                return "none"
+            way_out = ""
+            if config.observation == "state":
+                way_out = "; --config.video_every_evals=0 needs no rendering"
+            raise UsageError(f"{error}{way_out}") from error
 
 
 def training_environment(config: Config) -> PixelEnvironment:
@@ -165,11 +171,11 @@ def load_demonstrations(
 ) -> loading.Demonstrations | None:
     """Returns the demonstrations of a run, rendered as the agent sees; or None.
 
-    Drawing them takes minutes at quality `paper` in software, the first time: a
+    Rendering them takes minutes at quality `paper` in software, the first time: a
     progress line is shown.
 
     Raises:
-      DemonstrationError: the file can't serve this run.
+      DemonstrationError: the file does not fit this run.
     """
     if not jaxil_config.uses_demonstrations(config):
         return None
@@ -177,7 +183,7 @@ def load_demonstrations(
 
     def show(done: int, total: int) -> None:
         if not lines:
-            label = "drawing the demonstrations, once"
+            label = "rendering the demonstrations, once"
             lines.append(
                 ProgressLine(total, first_frame=done, label=label, unit="images")
             )

@@ -12,14 +12,17 @@ changed array is restored silently, renames nothing else into place together wit
 arrays, and deletes a checkpoint of the same frame before it writes the new one.
 """
 
+import functools
 import os
 import pathlib
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from flax.traverse_util import unflatten_dict
 
 from jaxil.files import writing
+from jaxil.learner.state import LearnerParams
 from jaxil.machine import screen
 from jaxil.replay import episode_files
 from jaxil.replay.replay import Replay
@@ -31,6 +34,7 @@ _NUM_KEPT = 2  # the newest, and the one to fall back to
 # All stored rewards, in the order of their episodes: they may be newer than those in
 # the episodes' files, which never change.
 _REWARDS = "rewards"
+_MEAN_IMAGE = "mean_image"
 
 
 class CheckpointError(RunFolderError):
@@ -66,7 +70,13 @@ class Checkpoints:
         return run_folder.newest_checkpoint(self._workdir)
 
     def save(
-        self, *, frame: int, learner_state: Any, counters: dict, replay: Replay
+        self,
+        *,
+        frame: int,
+        learner_state: Any,
+        counters: dict,
+        replay: Replay,
+        mean_image: np.ndarray | None = None,
     ) -> None:
         """Writes a checkpoint, and the episodes added since the one before.
 
@@ -76,6 +86,8 @@ class Checkpoints:
           counters: what else the run needs to resume, as JSON can hold it (whole
             numbers of any size included); tuples come back as lists.
           replay: only read.
+          mean_image: that the encoder subtracts, where it is not a constant: without
+            it a policy could not be used without the demonstrations.
 
         Raises:
           CheckpointError: if the folder has checkpoints and none was restored.
@@ -88,10 +100,16 @@ class Checkpoints:
                 " --workdir"
             )
         with run_folder.writes_to(self._workdir):
-            self._save(frame, learner_state, counters, replay)
+            images = {} if mean_image is None else {_MEAN_IMAGE: mean_image}
+            self._save(frame, learner_state, counters, replay, images)
 
     def _save(
-        self, frame: int, learner_state: Any, counters: dict, replay: Replay
+        self,
+        frame: int,
+        learner_state: Any,
+        counters: dict,
+        replay: Replay,
+        arrays: dict[str, np.ndarray],
     ) -> None:
         for folder in (self._checkpoints, self._replay):
             folder.mkdir(exist_ok=True)
@@ -116,9 +134,8 @@ class Checkpoints:
         path = self._free_path(frame)
         with writing.replacing(path) as temporary:
             all_rewards = np.concatenate([*rewards, np.zeros(0, np.float32)])
-            learner_files.write(
-                temporary, learner_state, record, {_REWARDS: all_rewards}
-            )
+            arrays = {_REWARDS: all_rewards, **arrays}
+            learner_files.write(temporary, learner_state, record, arrays)
         self._remember(path, record)
 
         kept = self._committed()[-_NUM_KEPT:]
@@ -147,14 +164,41 @@ class Checkpoints:
           CheckpointError: if there is no checkpoint, none can be read, or it is of
             another learner.
         """
+        path, record, learner_state = self._read(
+            functools.partial(learner_files.as_state, abstract_learner_state)
+        )
+        if replay is not None:
+            self._refill(replay, record, path / f"{_REWARDS}.npy")
+        self._remember(path, record)
+        return learner_state, record["counters"]
+
+    def read_policy(self) -> tuple[dict[str, Any], np.ndarray | None, dict]:
+        """Reads what it takes to act, as `restore` does.
+
+        Returns:
+          The parameters of encoder, actor and critic by these names; the mean image
+          that the encoder subtracts, None where there is none; and the counters.
+
+        Raises:
+          CheckpointError: there is no checkpoint, or none can be read.
+        """
+        path, record, tree = self._read(
+            lambda _, arrays: unflatten_dict(arrays, sep=".")
+        )
+        networks = {name: tree[name]["params"] for name in LearnerParams._fields}
+        image = path / f"{_MEAN_IMAGE}.npy"
+        return networks, np.load(image) if image.exists() else None, record["counters"]
+
+    def _read(
+        self, make: Callable[[dict, dict[str, np.ndarray]], Any]
+    ) -> tuple[pathlib.Path, dict, Any]:
+        """Returns path, record, and what `make` makes of record and arrays."""
         faults = []
         for path in reversed(self._committed()):
             frame = _order(path)[0]
             try:
                 record, arrays = learner_files.read(path)
-                learner_state = learner_files.as_state(
-                    abstract_learner_state, record, arrays
-                )
+                made = make(record, arrays)
             except learner_files.OtherLearnerError as error:
                 raise CheckpointError(
                     f"{path}: the checkpoint is of another learner: {error}; use the "
@@ -164,11 +208,8 @@ class Checkpoints:
                 faults.append(f"the checkpoint of frame {frame} is damaged ({error})")
                 continue
             if faults:
-                self._say(f"{'; '.join(faults)}: resuming from frame {frame}")
-            if replay is not None:
-                self._refill(replay, record, path / f"{_REWARDS}.npy")
-            self._remember(path, record)
-            return learner_state, record["counters"]
+                self._say(f"{'; '.join(faults)}: using that of frame {frame}")
+            return path, record, made
         if not faults:
             raise CheckpointError(
                 f"{self._checkpoints}: expected a checkpoint, found none; train first,"

@@ -15,6 +15,7 @@ from jax import Array
 from jaxil.config import Config
 from jaxil.demonstrations import loading
 from jaxil.environments.evaluation import evaluate
+from jaxil.files.untrusted import read_regular
 from jaxil.files.writing import write_atomically
 from jaxil.maths.transport import sinkhorn_divergence
 from jaxil.maths.types import Episode
@@ -161,7 +162,7 @@ def _random_encoder(frame_shape: tuple[int, ...]) -> nn.Module:
 def _read(path: pathlib.Path) -> float | None:
     """Returns a stored distance; None if it has to be computed again."""
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(read_regular(path))
         intact = content.pop("checksum") == _checksum(content)
         distance = float(content["distance"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):

@@ -14,8 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxil.errors import printable
+from jaxil.files.untrusted import read_regular
+
 _FORMAT = 1
 _CHECKSUMS = "checksums.json"
+_MAX_BYTES = 2**40  # of a file: no limit for true ones
 
 
 class OtherLearnerError(ValueError):
@@ -88,7 +92,7 @@ def read(folder: pathlib.Path) -> tuple[dict, dict[str, np.ndarray]]:
         # Before orbax sees it: on a damaged file, orbax leaves tracebacks of its
         # threads on the screen, and a change within an array passes unnoticed. Files
         # that were not there then, such as a file manager's, do not matter.
-        expected = json.loads((folder / _CHECKSUMS).read_text())
+        expected = json.loads(read_regular(folder / _CHECKSUMS))
         if not expected or _checksums(folder, expected) != expected:
             raise ValueError("its files are not as they were written")
         with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
@@ -132,7 +136,7 @@ def as_state(abstract_state: Any, record: dict, arrays: dict[str, np.ndarray]) -
             leaves.append(leaf)
     if faults:
         more = f" and {len(faults) - 5} more" if len(faults) > 5 else ""
-        raise OtherLearnerError("; ".join(faults[:5]) + more)
+        raise OtherLearnerError("; ".join(printable(f, 200) for f in faults[:5]) + more)
     return jax.tree.unflatten(jax.tree.structure(abstract_state), leaves)
 
 
@@ -162,9 +166,10 @@ def _kind(leaf: Any) -> str:
 
 
 def _checksums(folder: pathlib.Path, names: list[str]) -> dict[str, int]:
-    return {name: zlib.crc32((folder / name).read_bytes()) for name in names}
+    return {name: zlib.crc32(read_regular(folder / name, _MAX_BYTES)) for name in names}
 
 
 def _one_line(error: Exception) -> str:
     first = next(iter(str(error).strip().splitlines()), "")
-    return f"{type(error).__name__}: {first[:160]}" if first else type(error).__name__
+    name = type(error).__name__
+    return f"{name}: {printable(first, 160)}" if first else name

@@ -1,32 +1,82 @@
 """A policy that a run has learned, taken from its newest checkpoint."""
 
+import os
 import pathlib
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
+from jaxil import config as jaxil_config
 from jaxil.config import Config
 from jaxil.demonstrations import loading
+from jaxil.demonstrations.states import DemonstrationError
 from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.errors import UsageError
+from jaxil.learner.policy import make_mean_action
 from jaxil.learner.state import LearnerParams
+from jaxil.machine import devices, screen
+from jaxil.networks.agent import AgentNetworks
 from jaxil.training import agent as agents
 from jaxil.training import assembly, workdir
 from jaxil.training.checkpoint import CheckpointError, Checkpoints
 
 
-class Trained(NamedTuple):
-    """A learned policy and what it takes to play it."""
+class Policy:
+    """A learned policy: observations in, mean actions out.
 
-    config: Config
-    environment: PixelEnvironment  # a separate one, not the training's
-    act: Callable[[np.ndarray], np.ndarray]  # observation -> mean action
-    params: LearnerParams
-    demonstrations: loading.Demonstrations | None
-    frame: int  # environment frames of training
-    episode: int  # training episodes
-    seconds: float  # wall clock of the training
+    Attributes:
+      config: of the run.
+      frame: environment frames of training.
+      seconds: wall-clock time of training.
+      observation_shape: (H, W, 3 * frame_stack), frames stacked oldest first, or (S,).
+      observation_dtype: uint8 for pixels, float32 for states.
+      networks: the modules, and
+      params: their parameters.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        networks: AgentNetworks,
+        params: LearnerParams,
+        counters: dict[str, Any],
+    ) -> None:
+        """See `load_policy`."""
+        self.config, self.networks, self.params = config, networks, params
+        self.frame: int = counters["num_steps"] * config.action_repeat
+        self.seconds: float = counters["seconds"]
+        pixels = config.observation == "pixels"
+        side, channels = config.image_size, 3 * config.frame_stack
+        self.observation_dtype = np.uint8 if pixels else np.float32
+        self.observation_shape: tuple[int, ...] = (side, side, channels)
+        if not pixels:
+            (layer,) = params.encoder["params"].values()
+            self.observation_shape = layer["kernel"].shape[:1]
+        self._act = jax.jit(make_mean_action(networks))
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Returns the mean action, float32 [A] in [-1, 1], or [B, A] for a batch.
+
+        Args:
+          observation: `observation_shape`, or that behind a batch axis [B, ...].
+
+        Raises:
+          ValueError: it has another shape or type.
+        """
+        observation = np.asarray(observation)
+        shape = self.observation_shape
+        is_single = observation.shape == shape
+        if observation.dtype != self.observation_dtype or (
+            not is_single and observation.shape[1:] != shape
+        ):
+            raise ValueError(
+                f"observation is {observation.dtype}{list(observation.shape)}: expected"
+                f" {np.dtype(self.observation_dtype)}{list(shape)}, or a batch of them"
+            )
+        batch = observation[None] if is_single else observation
+        actions = np.asarray(self._act(self.params.encoder, self.params.actor, batch))
+        return actions[0] if is_single else actions
 
     def description(self) -> str:
         """Returns a few words on the training."""
@@ -37,8 +87,11 @@ class Trained(NamedTuple):
         )
 
 
-def load(folder: pathlib.Path) -> Trained:
-    """Reads the newest whole checkpoint of a run, which may still be running.
+def load_policy(folder: str | os.PathLike) -> Policy:
+    """Returns the policy of a run's newest whole checkpoint.
+
+    The run may still be running. Neither its demonstrations nor the simulator are
+    needed.
 
     Args:
       folder: `--workdir` of the run.
@@ -46,29 +99,47 @@ def load(folder: pathlib.Path) -> Trained:
     Raises:
       UsageError: there is no run, no checkpoint, or none can be read.
     """
+    devices.device_name()  # a wrong JAX_PLATFORMS is said first
+    folder = pathlib.Path(folder).expanduser()
     config = workdir.read_config(folder)
-    faults = assembly.problems(config)
+    faults = jaxil_config.problems(config, known_tasks=(config.task,))
     if faults:
         raise UsageError(f"{folder / 'config.json'}: {'; '.join(map(str, faults))}")
-    environment = assembly.evaluation_environment(config)
-    demonstrations = assembly.load_demonstrations(config)
-    agent = agents.make_agent(config, environment, demonstrations)
     try:
-        state, counters = Checkpoints(folder).restore(agents.abstract_state(agent))
+        params, mean, counters = Checkpoints(folder).read_policy()
     except CheckpointError as error:
         raise UsageError(str(error)) from error
-    encoder, actor, _ = state.params
+    if config.encoder.subtract_mean_image and mean is None:  # of an earlier version
+        mean = agents.mean_image(config, assembly.load_demonstrations(config))
+    head = params["actor"]["params"]["head"]
+    (action_dim,) = head["output"]["bias"].shape
+    networks = agents.make_networks(config, action_dim, 0.5 if mean is None else mean)
+    params = jax.tree.map(jax.numpy.asarray, params)
+    return Policy(config, networks, LearnerParams(**params), counters)
 
-    def act(observation: np.ndarray) -> np.ndarray:
-        return np.asarray(agent.mean_action(encoder, actor, observation[None]))[0]
 
-    return Trained(
-        config=config,
-        environment=environment,
-        act=act,
-        params=state.params,
-        demonstrations=demonstrations,
-        frame=counters["num_steps"] * config.action_repeat,
-        episode=counters["num_episodes"],
-        seconds=counters["seconds"],
-    )
+class Trained(NamedTuple):
+    """A learned policy, and what it takes to play and judge it."""
+
+    config: Config
+    act: Policy
+    environment: PixelEnvironment  # a separate one, not the training's
+    demonstrations: loading.Demonstrations | None
+
+
+def load(folder: str | os.PathLike) -> Trained:
+    """Returns the policy with an environment, and the run's demonstrations if any.
+
+    Demonstrations that have moved are done without, which is said.
+
+    Raises:
+      UsageError: see `load_policy`.
+    """
+    policy = load_policy(folder)
+    config, demonstrations = policy.config, None
+    try:
+        demonstrations = assembly.load_demonstrations(config)
+    except DemonstrationError as error:
+        screen.say(f"without demonstrations: {error}")
+    environment = assembly.evaluation_environment(config)
+    return Trained(config, policy, environment, demonstrations)

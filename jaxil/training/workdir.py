@@ -11,15 +11,20 @@ from typing import Any
 from jaxil import config as jaxil_config
 from jaxil import outside
 from jaxil.config import Config, default_config
+from jaxil.demonstrations import loading
+from jaxil.demonstrations.states import DemonstrationError
 from jaxil.environments import tasks
-from jaxil.errors import Fault, UsageError
+from jaxil.errors import Fault, UsageError, printable
 from jaxil.files import locking, writing
 from jaxil.files.settings import as_stored, flat
+from jaxil.files.untrusted import read_regular
 
 # Its frame; a second number tells two checkpoints of one frame apart.
 CHECKPOINT = re.compile(r"frame_(\d{12,})(?:_(\d+))?")
+_SOURCE, _DIGEST = "demonstrations.source", "demonstrations_digest"
 # No file of a run takes longer between two writes.
 _LEFTOVER_SECONDS = 60.0
+_MAX_CONFIG_BYTES = 10**7
 
 
 class RunFolderError(Exception):
@@ -73,10 +78,16 @@ def problems(workdir: pathlib.Path, config: Config) -> list[Fault]:
     if not (workdir / "config.json").exists():
         return []
     try:
-        before = read_config(workdir, trusted=config.task)
+        before = read_config(workdir)
     except UsageError as error:
         return [Fault("workdir", f"cannot be resumed: {error}", value=str(workdir))]
     different = _differences(before, config)
+    stored = _read_json(workdir / "config.json").get(_DIGEST)
+    if stored is not None and jaxil_config.uses_demonstrations(config):
+        # The content decides, not its path.
+        different = [each for each in different if not each.startswith(_SOURCE)]
+        if demonstrations_digest(config) not in (stored, None):
+            different.append(f"{_SOURCE}: its content has changed since")
     if different:
         return [
             Fault(
@@ -150,25 +161,25 @@ def newest_checkpoint(workdir: pathlib.Path) -> int | None:
     return max((int(match[1]) for match in matches), default=None)
 
 
-def read_config(workdir: pathlib.Path, *, trusted: str = "") -> Config:
-    """Returns the config of the run in a folder.
-
-    Where it names a module of the user's own, so must the command line, unless
-    `trusted` is that name.
+def read_config(workdir: pathlib.Path) -> Config:
+    """Returns the config of the run in a folder, whoever wrote it.
 
     Fields that did not exist when it was written have their defaults: these are what
     was done before there was a choice. Those that no longer exist are left out.
 
     Raises:
-      UsageError: there is none, or it cannot be read.
+      UsageError: there is none, it cannot be read, or its method is neither installed
+        nor named by the user (see `methods.is_trusted`).
     """
     path = workdir / "config.json"
     try:
-        stored = json.loads(path.read_text())["config"]
-        task = str(stored["task"])
-        if tasks.names_code(task) and task != trusted:
-            outside.require_named(task, "task", path)
-        config = default_config(stored["method"], task)
+        stored = _read_json(path)["config"]
+        method, task = str(stored["method"]), str(stored["task"])
+        if ":" in method:
+            outside.require_trusted(method, "method", path)
+        if tasks.names_code(task):
+            outside.require_trusted(task, "task", path)
+        config = default_config(method, task)
         known = jaxil_config.fields(stored["method"])
         there = flat(stored)
         for field in known.keys() & there.keys():
@@ -196,15 +207,34 @@ def write_config(
     Raises:
       RunFolderError: the folder is not writable.
     """
-    text = json.dumps({"config": config.to_dict(), **machine}, indent=2)
+    content = {"config": config.to_dict(), **machine}
+    if jaxil_config.uses_demonstrations(config):
+        content[_DIGEST] = demonstrations_digest(config)
+    text = json.dumps(content, indent=2)
     with writes_to(workdir):
         writing.write_atomically(workdir / "config.json", f"{text}\n".encode())
+
+
+def demonstrations_digest(config: Config) -> str | None:
+    """Returns a digest of what the demonstrations' file holds; None if unreadable."""
+    try:
+        return loading.digest(config.demonstrations.source, config.task)
+    except DemonstrationError:
+        return None
+
+
+def _read_json(path: pathlib.Path) -> dict[str, Any]:
+    return json.loads(read_regular(path, _MAX_CONFIG_BYTES))
 
 
 def _differences(there: Config, here: Config) -> list[str]:
     before, now = flat(as_stored(there.to_dict())), flat(as_stored(here.to_dict()))
     return [
-        f"{field}: {before.get(field)!r} there, {now.get(field)!r} here"
+        f"{field}: {_shown(before, field)} there, {_shown(now, field)} here"
         for field in sorted(before.keys() | now.keys())
         if before.get(field) != now.get(field) and field not in jaxil_config.FREE_FIELDS
     ]
+
+
+def _shown(settings: dict[str, Any], field: str) -> str:
+    return printable(repr(settings.get(field)), 100)

@@ -61,20 +61,17 @@ def _load_judge(folder: pathlib.Path) -> tuple[Judge, float, str]:
 
     from jaxil.command import UsageError
     from jaxil.networks.agent import apply
-    from jaxil.training import assembly, trained, workdir
+    from jaxil.training import trained
 
-    config = workdir.read_config(folder)
+    policy = trained.load_policy(folder)
+    config = policy.config
     for field, wanted in (("task", TASK), ("observation", "state")):
         if config[field] != wanted:
             raise UsageError(
                 f"--workdir={folder} is a run with {field}={config[field]!r}, not "
                 f"{wanted!r}; name a run of configs/expert.py:{TASK}"
             )
-    run = trained.load(folder)
-    encoder, actor, critic = run.params
-    action_dim = run.environment.action_spec().shape[0]
-    networks = assembly.make_networks(config, action_dim, mean=0.5)
-    run.environment.close()
+    networks, (encoder, actor, critic) = policy.networks, policy.params
 
     @jax.jit
     def judge(observations: Any) -> tuple[jax.Array, jax.Array]:
@@ -86,7 +83,7 @@ def _load_judge(folder: pathlib.Path) -> tuple[Judge, float, str]:
     return (
         lambda observations: jax.tree.map(np.asarray, judge(observations)),
         config.discount_factor,
-        run.description(),
+        policy.description(),
     )
 
 

@@ -422,7 +422,7 @@ def test_a_file_cut_off_is_refused(path, name):
 
 def test_without_pyarrow_one_is_told_what_to_install(path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(FormatError, match=r"pyarrow: pip install 'jaxil\[lerobot\]'"):
+    with pytest.raises(FormatError, match=r"pyarrow: pip install pyarrow"):
         read(path)
 
 

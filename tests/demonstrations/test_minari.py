@@ -392,7 +392,7 @@ def test_another_format_of_minari_is_recognised_and_refused(path):
 
 def test_without_h5py_one_is_told_what_to_install(path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(FormatError, match=r"needs h5py: pip install 'jaxil\[minari\]'"):
+    with pytest.raises(FormatError, match=r"needs h5py: pip install h5py"):
         read(path)
 
 

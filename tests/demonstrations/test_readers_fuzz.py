@@ -66,14 +66,16 @@ def test_damaged_files_are_read_or_refused(name, tmp_path):
     assert not any("\n" in outcome or "\x1b" in outcome for outcome in outcomes)
 
 
-def read_mutants(name: str, folder: pathlib.Path, num_mutants: int) -> Iterator[str]:
-    """Yields what became of each file; that of seed 0 is sound."""
+def read_mutants(
+    name: str, folder: pathlib.Path, num_files: int, first_seed: int = 1
+) -> Iterator[str]:
+    """Yields what became of each file; the first is sound, the others are mutants."""
     form = FORMATS[name]
     for variant in range(form.num_variants):
         (folder / f"sound{variant}").mkdir()
         write = getattr(foreign_files, form.write)
         write(folder / f"sound{variant}" / "data", variant)
-    for seed in range(num_mutants):
+    for seed in (0, *range(first_seed, first_seed + num_files - 1)):
         shutil.rmtree(folder / "mutant", ignore_errors=True)
         shutil.copytree(folder / f"sound{seed % form.num_variants}", folder / "mutant")
         if seed > 0:

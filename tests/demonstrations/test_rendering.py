@@ -75,7 +75,7 @@ def pixels_in(folder):
 
 def children() -> list[int]:
     """Returns the processes of multiprocessing that this one has started."""
-    return [process.pid for process in multiprocessing.active_children()]
+    return [each.pid for each in multiprocessing.active_children() if each.pid]
 
 
 def test_two_processes_render_what_one_renders(alone, tmp_path, caplog):

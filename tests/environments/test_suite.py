@@ -8,7 +8,8 @@ from dm_env import specs
 
 from jaxil.environments import suite
 from jaxil.environments.interaction import Environment
-from jaxil.environments.suite import PixelEnvironment, make_environment
+from jaxil.environments.pixel_environment import PixelEnvironment
+from jaxil.environments.suite import SuiteEnvironment, make_environment
 
 SIZE = 24
 # Plain, with a moving camera, with a string, with a target drawn at each reset.
@@ -18,7 +19,7 @@ TASKS = ("cartpole_swingup", "walker_walk", "ball_in_cup_catch", "finger_turn_ha
 _made: list[PixelEnvironment] = []
 
 
-def small(task="cartpole_swingup", **changes) -> PixelEnvironment:
+def small(task="cartpole_swingup", **changes) -> SuiteEnvironment:
     environment = make_environment(
         task, **({"seed": 1, "image_size": SIZE, "render_quality": "fast"} | changes)
     )

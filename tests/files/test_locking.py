@@ -4,12 +4,13 @@ import errno
 import fcntl
 import json
 import os
-import platform
 import subprocess
 import sys
+import time
 
 import pytest
 
+from jaxil.files import locking
 from jaxil.files.locking import InUseError, is_locked, locked
 
 
@@ -53,22 +54,87 @@ def _without_locks(monkeypatch):
     monkeypatch.setattr(fcntl, "flock", refuse)
 
 
-def test_a_dead_owner_is_replaced(tmp_path, monkeypatch):
+HOLD = """
+import errno, fcntl, pathlib, sys
+def refuse(*_):
+    raise OSError(errno.ENOLCK, "no locks available")
+fcntl.flock = refuse
+from jaxil.files import locking
+from jaxil.files.locking import locked
+with locked(pathlib.Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def left(tmp_path, monkeypatch):
+    """A lock whose owner was killed, on a file system without locks."""
     _without_locks(monkeypatch)
-    process = subprocess.Popen([sys.executable, "-c", ""])
-    process.wait()
-    content = [platform.node(), process.pid, "2026-01-01 00:00:00"]
-    (tmp_path / "lock.owner").write_text(json.dumps(content))
+    path = tmp_path / "lock"
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"held\n"
+        assert is_locked(path)
+        process.kill()
+    assert (tmp_path / "lock.owner").exists()
+    return path
+
+
+def _change_owner(path, place: int, value) -> None:
+    owner = path.with_name("lock.owner")
+    content = json.loads(owner.read_text())
+    content[place] = value
+    owner.write_text(json.dumps(content))
+
+
+def test_an_owner_that_was_killed_is_replaced_at_once(left):
+    assert not is_locked(left)
+    with locked(left):
+        assert is_locked(left)
+    assert not left.with_name("lock.owner").exists()
+
+
+def test_another_process_with_the_owner_s_number_is_not_the_owner(left):
+    _change_owner(left, 3, os.getpid())
+    assert not is_locked(left)
+
+
+@pytest.mark.parametrize("place", [0, 1, 2], ids=["host", "boot", "container"])
+def test_an_owner_elsewhere_lives_as_long_as_it_touches_its_file(left, place):
+    _change_owner(left, place, "elsewhere")
+    assert is_locked(left)
+    an_hour_ago = time.time() - 3600
+    os.utime(left.with_name("lock.owner"), (an_hour_ago, an_hour_ago))
+    assert not is_locked(left)
+    with locked(left):
+        assert is_locked(left)
+
+
+def test_an_owner_touches_its_file(tmp_path, monkeypatch):
+    _without_locks(monkeypatch)
+    monkeypatch.setattr(locking, "_HEARTBEAT_SECONDS", 0.01)
+    owner = tmp_path / "lock.owner"
     with locked(tmp_path / "lock"):
-        owner = json.loads((tmp_path / "lock.owner").read_text())
-        assert owner[:2] == [platform.node(), os.getpid()]
-    assert not (tmp_path / "lock.owner").exists()
+        os.utime(owner, (0, 0))
+        end = time.monotonic() + 30
+        while owner.stat().st_mtime < 1 and time.monotonic() < end:
+            time.sleep(0.01)
+        assert owner.stat().st_mtime > 1
 
 
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ('["elsewhere", 7, "2026-01-01"]', "process 7 on elsewhere since 2026-01-01"),
+        (
+            '["elsewhere", "", "", 7, "1", "2026-01-01"]',
+            "process 7 on elsewhere since 2026-01-01",
+        ),
+        ('["else\\u001b[2Jwhere", "", "", 7, "1", ""]', r"else\?\[2Jwhere"),
         ("[" * 100_000, "an unknown process"),
         ("", "an unknown process"),
     ],
@@ -82,3 +148,9 @@ def test_another_host_s_owner_is_named_with_the_way_out(
         pass
     assert f"delete {tmp_path / 'lock.owner'}" in str(caught.value)
     assert (tmp_path / "lock.owner").read_text() == content
+
+
+def test_a_pipe_in_place_of_a_lock_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "lock")
+    with pytest.raises(OSError, match="lock"), locked(tmp_path / "lock"):
+        pass

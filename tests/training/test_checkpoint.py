@@ -276,7 +276,7 @@ def test_a_damaged_newest_checkpoint_falls_back(tmp_path, seed):
     assert_same_replay(at_first, restored)
     assert len(said) == 1
     assert said[0].startswith("the checkpoint of frame 2 is damaged (")
-    assert said[0].endswith(": resuming from frame 1")
+    assert said[0].endswith(": using that of frame 1")
     assert "\n" not in said[0]
 
     # Resumed: another episode 4 than the damaged checkpoint knew, and another frame 2.

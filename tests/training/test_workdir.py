@@ -38,6 +38,21 @@ def test_a_run_may_be_resumed_for_longer_or_with_other_convolutions(tmp_path):
     assert workdir.problems(tmp_path, config) == []
 
 
+def test_demonstrations_may_move_but_not_change(tmp_path):
+    config = jaxil_config.default_config("pdac", "walker_walk")
+    first, moved = tmp_path / "first", tmp_path / "elsewhere" / "moved"
+    first.write_bytes(b"expert")
+    config.demonstrations.source = str(first)
+    workdir.write_config(tmp_path, config, {})
+    moved.parent.mkdir()
+    first.rename(moved)
+    config.demonstrations.source = str(moved)
+    assert workdir.problems(tmp_path, config) == []
+    moved.write_bytes(b"another")
+    (fault,) = workdir.problems(tmp_path, config)
+    assert "demonstrations.source: its content has changed" in str(fault)
+
+
 def test_a_former_field_is_left_out(tmp_path):
     config = jaxil_config.default_config("psil", "walker_walk")
     old = config.to_dict()

@@ -67,7 +67,7 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
     try:
         import pyarrow  # noqa: F401
     except ImportError:
-        raise FormatError("needs pyarrow: pip install 'jaxil[lerobot]'") from None
+        raise FormatError("needs pyarrow: pip install pyarrow") from None
     episodes = _find_episodes(dataset)
     notes = ()
     if "actions" not in dataset.columns:

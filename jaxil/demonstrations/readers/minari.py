@@ -56,7 +56,7 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
     try:
         import h5py
     except ImportError:
-        raise FormatError("needs h5py: pip install 'jaxil[minari]'") from None
+        raise FormatError("needs h5py: pip install h5py") from None
     require_regular(folder / _DATA)
     with h5py.File(folder / _DATA, "r", locking=False) as file:
         found = [re.fullmatch(r"episode_(\d{1,9})", str(name)) for name in file]

@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxil.files.untrusted import printable, require_regular
+from jaxil.errors import printable
+from jaxil.files.untrusted import require_regular
 
 
 class FormatError(ValueError):

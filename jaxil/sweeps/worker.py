@@ -11,15 +11,16 @@ import pathlib
 import signal
 import subprocess
 import sys
+import sysconfig
 import time
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
 from jaxil.files import locking
-from launch.sweeps import state
-from launch.sweeps.plan import ROOT
-from launch.sweeps.state import Run
+from jaxil.sweeps import state
+from jaxil.sweeps.state import Run
 
+_ROOT = pathlib.Path(__file__).parents[2]  # where the package is
 _POLL_SECONDS = 0.2
 _IDLE_SECONDS = 2.0
 _STOPPED_STATUS = 130  # of jaxil.launch, when someone asked it to stop
@@ -138,5 +139,7 @@ class Worker:
 
 def python_path() -> str:
     """Returns a PYTHONPATH in which processes find this project, wherever they are."""
-    before = os.environ.get("PYTHONPATH")
-    return os.pathsep.join([str(ROOT), *([before] if before else [])])
+    before = os.environ.get("PYTHONPATH", "")
+    # An installed package is found anyway; its folder must not come before Python's.
+    own = "" if pathlib.Path(sysconfig.get_path("purelib")) == _ROOT else str(_ROOT)
+    return os.pathsep.join(each for each in (own, before) if each)

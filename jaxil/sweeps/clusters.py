@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 
 from jaxil.errors import Fault, unknown_name
 from jaxil.machine import devices
-from launch.sweeps import state
-from launch.sweeps.state import Run
-from launch.sweeps.worker import Place, Worker, python_path
+from jaxil.sweeps import state
+from jaxil.sweeps.state import Run
+from jaxil.sweeps.worker import Place, Worker, python_path
 
 CLUSTERS = ("local", "slurm", "debug")
 _POLL_SECONDS = 0.5
@@ -66,7 +66,7 @@ def problems(cluster: Cluster, *, starts: bool) -> Iterator[Fault]:
     if starts and cluster.name == "slurm":
         if importlib.util.find_spec("submitit") is None:
             rule = "starts jobs with submitit, which is not installed"
-            way_out = "pip install 'jaxil[cluster]', or use --cluster=local"
+            way_out = "pip install submitit, or use --cluster=local"
             yield Fault("--cluster", rule, way_out, "slurm")
         if fault := _slurm_fault():
             way_out = "run this on a login node of your cluster, or use --cluster=local"

@@ -19,8 +19,9 @@ import os
 import pathlib
 from typing import NamedTuple
 
-from jaxil.errors import UsageError
+from jaxil.errors import UsageError, printable
 from jaxil.files import locking
+from jaxil.files.untrusted import open_regular, read_regular
 from jaxil.files.writing import write_atomically
 from jaxil.training import workdir
 
@@ -139,7 +140,7 @@ def note_failure(run: Run, exit_status: int) -> None:
 def failure(run: Run) -> int | None:
     """Returns the exit status that `note_failure` noted; None without."""
     try:
-        return int(json.loads((run.folder / "failed.json").read_text())["exit_status"])
+        return int(json.loads(read_regular(run.folder / "failed.json"))["exit_status"])
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return None
 
@@ -159,7 +160,7 @@ def note_slurm_job(run: Run, job: str) -> None:
 def slurm_job(run: Run) -> str | None:
     """Returns the Slurm job that was submitted for the run last."""
     try:
-        return (run.folder / "slurm_job").read_text()
+        return read_regular(run.folder / "slurm_job").decode()
     except (OSError, ValueError):
         return None
 
@@ -167,7 +168,8 @@ def slurm_job(run: Run) -> str | None:
 def last_lines(run: Run, number: int) -> list[str]:
     """Returns the end of the run's log."""
     try:
-        return _tail(run.folder / "log.txt").splitlines()[-number:]
+        lines = _tail(run.folder / "log.txt").splitlines()[-number:]
+        return [printable(line) for line in lines]
     except OSError:
         return []
 
@@ -205,8 +207,8 @@ def _last_row(path: pathlib.Path) -> dict[str, float]:
       ValueError: it is no table, or a number is not finite.
     """
     try:
-        with path.open(newline="") as file:
-            header = file.readline(_TAIL_BYTES)
+        with open_regular(path) as file:
+            header = file.readline(_TAIL_BYTES).decode(errors="replace")
         # A row counts once its line has an end: what follows the last one is cut off.
         *lines, _ = _tail(path).split("\n")
     except OSError:
@@ -227,7 +229,7 @@ def _last_row(path: pathlib.Path) -> dict[str, float]:
 
 
 def _tail(path: pathlib.Path) -> str:
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(size - _TAIL_BYTES, 0))
         return file.read().decode(errors="replace")

@@ -1,22 +1,20 @@
 """What a sweep is made of: each run's folder, settings and command."""
 
 import dataclasses
-import os
 import pathlib
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from jaxil import command, methods
+from jaxil import command, methods, presets
 from jaxil import config as jaxil_config
 from jaxil.config import Config
 from jaxil.errors import Fault, UsageError, unknown_name
 from jaxil.reporting import figures
+from jaxil.sweeps import state
+from jaxil.sweeps.state import Run
 from jaxil.training import workdir
-from launch.sweeps import state
-from launch.sweeps.state import Run
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
 PRESETS = ("paper", "tiny")
 _FIGURES = {f"figure{number}": figure for number, figure in figures.FIGURES.items()}
 # What the sweep itself sets in each run.
@@ -168,14 +166,12 @@ def _configured(
 
 
 def _preset(preset: str, method: str, task: str) -> list[str]:
-    """Returns the words of a preset, whose file is seen from the current folder."""
-    folder = os.path.relpath(ROOT / "configs")
+    """Returns the words of a preset."""
     if preset == "tiny":
-        return [f"--config={folder}/tiny.py:{method},{task}"]
-    if (ROOT / "configs" / f"{method}.py").is_file():
-        return [f"--config={folder}/{method}.py:{task}"]
-    # A method without a file of its own has its defaults.
-    return [f"--config={folder}/pdac.py:{task}", f"--config.method={method}"]
+        return [f"--config=tiny:{method},{task}"]
+    if method in presets.names():
+        return [f"--config={method}:{task}"]
+    return [f"--config=pdac:{task}", f"--config.method={method}"]  # from outside
 
 
 def _seeds(request: Request, config: Config, words: list[str]) -> Iterator[Run]:

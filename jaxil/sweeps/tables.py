@@ -14,8 +14,8 @@ from rich.live import Live
 from rich.table import Table
 
 from jaxil.machine.progress import duration
-from launch.sweeps import state
-from launch.sweeps.state import Run, State, Status
+from jaxil.sweeps import state
+from jaxil.sweeps.state import Run, State, Status
 
 Statuses = Mapping[Run, Status]
 

@@ -1,0 +1,40 @@
+"""Presets by name: `--config=NAME[:ARGUMENT]`.
+
+`METHOD:TASK` are the paper's settings of any known method; the modules of this folder
+are the others. The files of the repository's `configs/` are the same code.
+"""
+
+import importlib
+import pkgutil
+
+from jaxil import config as jaxil_config
+from jaxil import methods
+from jaxil.config import Config
+from jaxil.errors import UsageError, unknown_name
+
+_DEFAULT_TASK = "walker_walk"
+_OWN = tuple(module.name for module in pkgutil.iter_modules(__path__))
+
+
+def names() -> tuple[str, ...]:
+    """Returns the names of all presets."""
+    return (*_OWN, *methods.known())
+
+
+def get_config(name: str, argument: str | None = None) -> Config:
+    """Returns the settings of a preset.
+
+    Args:
+      name: one of `names()`.
+      argument: METHOD,TASK of `tiny`, TASK of the others; None for the preset's own
+        default.
+
+    Raises:
+      UsageError: there is no such preset, or the argument is wrong.
+    """
+    if name in _OWN:
+        module = importlib.import_module(f"{__name__}.{name}")
+        return module.get_config(*([] if argument is None else [argument]))
+    if name in methods.known():
+        return jaxil_config.default_config(name, argument or _DEFAULT_TASK)
+    raise UsageError(unknown_name("--config", name, names()))

@@ -1,0 +1,1 @@
+"""Many runs: the parts of `jaxil sweep`."""

@@ -1,1 +1,0 @@
-"""Many runs: the parts of `launch/sweep.py`."""
