@@ -207,6 +207,32 @@ def test_pixels_are_scaled_and_starts_depend_on_seed_and_number_alone():
     assert not np.array_equal(starts[0], starts[1])
 
 
+def test_environments_of_one_process_render_what_they_would_alone():
+    from jaxil.environments import tasks
+
+    def make(size):
+        task = "gymnasium:InvertedPendulum-v5"
+        environment = tasks.make_environment(task, seed=0, image_size=size)
+        environment.reset(episode=0)
+        return environment
+
+    one = make(24)
+    alone = [one.render()]
+    one.step(np.ones(1))
+    alone.append(one.render())
+    assert alone[0].std() > 0
+    assert not np.array_equal(*alone)
+    one.reset(episode=0)
+    other = make(32)
+    shown = other.render()
+    np.testing.assert_array_equal(one.render(), alone[0])
+    one.step(np.ones(1))
+    np.testing.assert_array_equal(other.render(), shown)
+    other.close()
+    np.testing.assert_array_equal(one.render(), alone[1])
+    one.close()
+
+
 @pytest.mark.parametrize(
     ("task", "discount"),
     [("gymnasium:InvertedPendulum-v5", 0.0), ("gymnasium:Reacher-v5", 1.0)],
