@@ -1,7 +1,7 @@
 """Imitation learning from pixel observations, in JAX.
 
     policy = jaxil.load_policy("runs/quickstart")
-    environment = jaxil.make_environment("cartpole_swingup", seed=0, action_repeat=4)
+    environment = policy.make_environment()  # or jaxil.make_environment(task, seed=0)
     demonstrations = jaxil.load_demonstrations(task="cartpole_swingup")
 
 These are imported where they are first used, so that `import jaxil` takes no time, and
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxil.demonstrations.loading import load as load_demonstrations
-    from jaxil.environments.suite import make_environment
+    from jaxil.environments.tasks import make_environment
     from jaxil.errors import UsageError
     from jaxil.training.trained import load_policy
 
@@ -23,7 +23,7 @@ _PLACES = {
     "UsageError": ("jaxil.errors", "UsageError"),
     "load_demonstrations": ("jaxil.demonstrations.loading", "load"),
     "load_policy": ("jaxil.training.trained", "load_policy"),
-    "make_environment": ("jaxil.environments.suite", "make_environment"),
+    "make_environment": ("jaxil.environments.tasks", "make_environment"),
 }
 
 

@@ -7,7 +7,7 @@ evaluates the mean actions of the runs' policies and records the best. The file 
 simulator states, from which each training renders pixels for its agent; for tasks that
 are not dm_control's, it holds pixels.
 
-    python -m jaxil.collect --policy=package.module:function --task=gymnasium:ID \\
+    jaxil collect --policy=package.module:function --task=gymnasium:ID \\
         --output=FILE.npz
 
 records a function of the task's own observation, a flat vector, that returns an action
@@ -186,15 +186,19 @@ def _write(
 
 
 def _inspect(values: flags.FlagValues) -> None:
-    from jaxil.demonstrations import inspection
+    from jaxil.demonstrations import inspection, states
     from jaxil.files.video import write_video
     from jaxil.files.writing import replacing
     from jaxil.machine import memory
+    from jaxil.machine.progress import shown
 
     path = pathlib.Path(values.inspect)
-    with _reported(path, f"--inspect={path}"):
+    if values.inspect in states.shipped_tasks() and not path.exists():
+        path = states.shipped_path(values.inspect)
+    with _reported(path, f"--inspect={path}"), shown("inspecting") as progress:
         seen = inspection.inspect(
             path,
+            progress=progress,
             image_size=values.image_size or _INSPECTED_SIZE,
             render_quality=values.render_quality,
             max_bytes=memory.spare_bytes(),
@@ -206,6 +210,7 @@ def _inspect(values: flags.FlagValues) -> None:
     folder = pathlib.Path(values.output or ".")
     sheet, video = folder / f"{name}_sheet.png", folder / f"{name}_episode0.mp4"
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         with replacing(sheet) as temporary:
             inspection.contact_sheet(seen).save(temporary, format="png")
         write_video(video, seen.video, fps=seen.frames_per_second, labels=(name, ""))
@@ -268,8 +273,8 @@ def _output_faults(values: flags.FlagValues) -> list[str]:
         return [] if values.inspect else ["--output=NAME.npz is missing"]
     output = pathlib.Path(values.output)
     if values.inspect:
-        exists = output.is_dir()
-        return [] if exists else [f"--output={output} must be an existing folder"]
+        is_free = output.is_dir() or not output.exists()
+        return [] if is_free else [f"--output={output} must be a folder"]
     if output.is_dir():
         return [f"--output={output} is a folder: name a file, NAME.npz"]
     if values.convert and output.resolve() == pathlib.Path(values.convert).resolve():
@@ -308,7 +313,7 @@ def _define(values: flags.FlagValues) -> None:
     text("task", help="for --policy: the task, as in configs")
     number("action_repeat", 2, "for --policy: frames of one step", 1, 100)
     command.define_trust(values)
-    text("inspect", help="file or folder of any format to summarise")
+    text("inspect", help="file or folder of any format, or task, to show")
     text("convert", help="file or folder to convert to pixels; also --convert IN OUT")
     text("output", help="NAME.npz; for --inspect a folder for contact sheet and video")
     number("num_episodes", 50, "episodes to record", 1, 10_000)

@@ -6,6 +6,7 @@ Exit status: 0 done; 2 wrong use, with one message that names every fault; 1 els
 import ast
 import importlib.machinery
 import importlib.util
+import os
 import pathlib
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -143,7 +144,7 @@ def _name(word: str) -> str:
 
 
 def joined(words: Sequence[str], values: flags.FlagValues | None = None) -> list[str]:
-    """Joins "--name value" to "--name=value", for these flags and config fields."""
+    """Joins "--name value" to "--name=value", and expands "~" in values."""
     values = values or flags.FlagValues()
     whole: list[str] = []
     rest = list(words)
@@ -155,7 +156,10 @@ def joined(words: Sequence[str], values: flags.FlagValues | None = None) -> list
         if word.startswith("-") and "=" not in word and takes_value and not is_switch:
             has_value = rest and not rest[0].startswith("--")
             word = f"{word}={rest.pop(0)}" if has_value else word
-        whole.append(word)
+        name, equals, value = word.partition("=")
+        # The shell leaves a "~" alone that follows a "=".
+        parts = [os.path.expanduser(part) for part in value.split(",")]
+        whole.append(f"{name}{equals}{','.join(parts)}")
     return whole
 
 
@@ -218,7 +222,7 @@ def _load(
 def _config_of_file(value: str) -> Config:
     """Runs get_config of FILE.py[:ARGUMENT], or of a preset, NAME[:ARGUMENT]."""
     name, colon, argument = value.partition(":")
-    path = pathlib.Path(name).expanduser()
+    path = pathlib.Path(name)
     if path.suffix != ".py" and not path.is_file():
         return presets.get_config(name, argument if colon else None).unlock()
     if not path.is_file():

@@ -50,6 +50,13 @@ FIELDS: dict[str, Field] = {
         "random colours, camera angle and background in each of the agent's episodes",
         choices=("none", "easy", "medium", "hard"),
     ),
+    "max_episode_frames": Field(
+        0,
+        "longest episode, cut off as by a time limit; 0: the task's own limit, or 1000 "
+        "if it has none",
+        0,
+        10**8,
+    ),
     "total_frames": Field(_EASY_FRAMES, "length of the run", 1, 10**10),
     # Replay and schedule.
     "replay_size_steps": Field(
@@ -275,6 +282,16 @@ def _problems(
                 f"use {nearest}",
                 value,
             )
+    longest = config.max_episode_frames / config.action_repeat
+    if not {"max_episode_frames", "action_repeat", "replay_size_steps"} & bad and (
+        longest > config.replay_size_steps
+    ):
+        yield Fault(
+            "max_episode_frames",
+            "does not fit the replay, which must hold whole episodes",
+            f"use replay_size_steps={math.ceil(longest)} or more",
+            config.max_episode_frames,
+        )
     if config.exploration_std_end > config.exploration_std_start:
         yield Fault(
             "exploration_std_end",

@@ -42,7 +42,7 @@ def main(argv: list[str]) -> None:
     from jaxil.training import workdir
 
     folder = workdir.from_flag(values.workdir)
-    output = pathlib.Path(values.output).expanduser()
+    output = pathlib.Path(values.output)
     startup.prepare()
     from jaxil.files.writing import write_atomically
     from jaxil.training import trained

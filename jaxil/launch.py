@@ -24,7 +24,7 @@ def main(argv: list[str]) -> int:
 
     from jaxil import doctor, train
     from jaxil.environments.pool import EnvironmentsFailed
-    from jaxil.machine import provenance
+    from jaxil.machine import devices, provenance
     from jaxil.training import agent as agents
     from jaxil.training import assembly
 
@@ -32,6 +32,7 @@ def main(argv: list[str]) -> int:
     faults = [*assembly.problems(config), *workdir.problems(folder, config)]
     if faults:
         raise UsageError(faults)
+    devices.device_name()  # a wrong JAX_PLATFORMS is said before jax is needed
     for finding in doctor.memory(config):
         screen.say(str(finding))
     gl_name = assembly.renderer_name(config)

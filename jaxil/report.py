@@ -84,7 +84,7 @@ def _named_runs(argv: list[str]) -> list[str]:
                 "seeds",
                 "videos",
                 "runs",
-                "method",
+                "trust",
             )
             named.append(word)
         else:

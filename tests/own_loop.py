@@ -6,17 +6,12 @@ Everything is handed around explicitly: the state goes into `update_step` and co
 of it, and what it learns from is sampled here.
 """
 
-# ruff: noqa: E402
-
-import jaxil
-
-jaxil.make_environment  # noqa: B018  (chooses settings of jax and OpenGL first)
-
 import numpy as np
 
 from jaxil import presets
 from jaxil.demonstrations import loading
 from jaxil.environments.evaluation import evaluate
+from jaxil.machine import startup
 from jaxil.training import agent as agents
 from jaxil.training import assembly
 
@@ -25,6 +20,7 @@ NUM_EPISODES, NUM_UPDATES = 2, 3
 
 def main() -> dict[str, float]:
     """Trains for a moment; returns the metrics of the last update."""
+    startup.prepare()  # settings of jax and OpenGL, before either is used
     config = presets.get_config("tiny", "pdac,cartpole_swingup")
     config.update(action_repeat=20, image_size=24, hidden_dim=16, batch_size=8)
     config.discriminator.update(hidden_dim=16, batch_size=8)

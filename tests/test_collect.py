@@ -43,10 +43,11 @@ def call(*flags: str) -> None:
 # --- showing --------------------------------------------------------------------------
 
 
-def test_states_are_shown_as_table_sheet_and_video(few, tmp_path, capsys):
-    folder = tmp_path / "shown"
-    folder.mkdir()
-    call(f"--inspect={few}", f"--output={folder}", *SIZES)
+def test_states_are_shown_as_table_sheet_and_video(few, tmp_path, capsys, monkeypatch):
+    folder = tmp_path / "made" / "shown"
+    # A task's name stands for its shipped file.
+    monkeypatch.setattr(states, "shipped_path", {"cartpole_swingup": few}.get)
+    call("--inspect=cartpole_swingup", f"--output={folder}", *SIZES)
     printed = capsys.readouterr().out
     for words in ("format: jaxil states", "task: cartpole_swingup", "episodes: 2"):
         assert words in printed
@@ -152,7 +153,7 @@ def test_pixels_keep_their_size_unless_another_is_asked_for(tmp_path):
         (["--workdirs=a", "--output=/proc/x.npz"], "cannot be written"),
         (["--inspect=none.npz"], "none.npz cannot be read"),
         (["--inspect=setup.cfg"], "in an unsupported format"),
-        (["--inspect=setup.cfg", "--output=setup.cfg"], "must be an existing folder"),
+        (["--inspect=setup.cfg", "--output=setup.cfg"], "must be a folder"),
         (["--convert=setup.cfg", "--output=x.npz"], "in an unsupported format"),
         (["--convert", "a", "b", "c"], "'c' is not a flag"),
         (["--inspect=a", "--image_size=2"], "image_size"),

@@ -36,6 +36,14 @@ def test_a_value_may_follow_after_a_space():
     assert fault == "seed='' has the wrong type: expected a whole number"
 
 
+def test_a_tilde_in_a_value_is_the_home_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "own.py").write_text("from jaxil.presets.tiny import get_config")
+    source = "--config.demonstrations.source=~/a.npz"
+    config = command.read_config(command.joined(["--config=~/own.py", source]))
+    assert config.demonstrations.source == str(tmp_path / "a.npz")
+
+
 def test_the_sections_follow_the_method():
     words = ("--config.sinkhorn.epsilon=0.02", "--config.method=psil")
     config = _parse(PDAC, *words).config

@@ -56,6 +56,8 @@ def test_pdac_trains_shows_itself_and_is_evaluated_again(tmp_path):
     np.testing.assert_allclose(actions, policy(seen), atol=1e-5)
     np.testing.assert_allclose(policy(seen[1]), actions[1], atol=1e-5)
     assert np.ptp(actions, axis=0).min() > 1e-4  # it looks at what it is shown
+    with policy.make_environment(seed=3) as environment:
+        assert environment.reset().observation.shape == policy.observation_shape
     with pytest.raises(ValueError, match="expected uint8"):
         policy(seen / 255.0)
 

@@ -2,7 +2,7 @@
 
 import itertools
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,6 +47,7 @@ def inspect(
     max_bytes: int,
     camera: str = "",
     frame_skip: int = 1,
+    progress: Callable[[int, int], None] = lambda done, total: None,
     **view: Any,
 ) -> Inspection:
     """Reads a demonstration file of any format; renders samples of simulator states.
@@ -56,6 +57,7 @@ def inspect(
       max_bytes: limit of each unpacked array.
       camera: of a dataset with several.
       frame_skip: keeps every n-th frame of pixels.
+      progress: called with (done, all): images of states, or episodes of pixels.
       view: `image_size` and `render_quality` for states; videos are shrunk until their
         shorter side is `image_size`.
 
@@ -65,7 +67,7 @@ def inspect(
       FormatError: another file is damaged or has an unknown format.
     """
     if states.recognises(path):
-        return _inspect_states(path, view)
+        return _inspect_states(path, progress, view)
     recording = foreign.open_recording(
         path,
         max_bytes=max_bytes,
@@ -78,6 +80,7 @@ def inspect(
     summaries, pictures, video = [], [], np.empty((0, 1, 1, 3), np.uint8)
     height = width = 0
     for episode in recording.episodes:
+        progress(len(summaries), recording.num_episodes)
         frames, actions, rewards = episode.frames, episode.actions, episode.rewards
         height, width = episode.stored_size or frames.shape[1:3]
         if len(pictures) < _NUM_ROWS:
@@ -107,10 +110,20 @@ def inspect(
     return Inspection(facts, summaries, pictures, video, fps or _DEFAULT_FPS)
 
 
-def _inspect_states(path: pathlib.Path, view: dict[str, Any]) -> Inspection:
+def _inspect_states(
+    path: pathlib.Path, progress: Callable[[int, int], None], view: dict[str, Any]
+) -> Inspection:
     stored = _read_states(path)
     metadata = stored.metadata
     num_episodes, num_steps = stored.rewards.shape
+    num_rows = min(num_episodes, _NUM_ROWS)
+    total = num_rows * NUM_COLUMNS + num_steps + 1
+    pictures = []
+    for row in range(num_rows):
+        progress(row * NUM_COLUMNS, total)
+        pictures.append(_render(stored, row, spaced(num_steps + 1), view))
+    before = total - num_steps - 1
+    view = {**view, "progress": lambda done, _: progress(before + done, total)}
     versions = ", ".join(f"{k} {v}" for k, v in metadata["versions"].items())
     return Inspection(
         facts={
@@ -125,10 +138,7 @@ def _inspect_states(path: pathlib.Path, view: dict[str, Any]) -> Inspection:
             EpisodeSummary(num_steps + 1, "rendered", stored.actions.shape[2], value)
             for value in metadata["returns"]
         ],
-        pictures=[
-            _render(stored, episode, spaced(num_steps + 1), view)
-            for episode in range(min(num_episodes, _NUM_ROWS))
-        ],
+        pictures=pictures,
         video=_render(stored, 0, slice(None), view),
         frames_per_second=_fps(stored),
     )

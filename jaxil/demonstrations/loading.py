@@ -1,7 +1,6 @@
 """Loads demonstrations of any format as the agent observes them, and samples them."""
 
 import functools
-import hashlib
 import os
 import pathlib
 from collections.abc import Callable
@@ -253,27 +252,6 @@ def sample_indices(
     )
     successor = stacks(steps + 1) if successors else None
     return ExpertBatch(stacks(steps), actions, successor)
-
-
-def digest(source: str | os.PathLike, task: str) -> str:
-    """Returns a digest of a source's content, which does not depend on its path.
-
-    Raises:
-      DemonstrationError: it cannot be read.
-    """
-    path = _path_of(source, task)
-    total = hashlib.blake2b(digest_size=16)
-    try:
-        parts = sorted(path.rglob("*")) if path.is_dir() else [path]
-        for part in parts:
-            if part.is_file():
-                with part.open("rb") as file:
-                    one = hashlib.file_digest(file, "blake2b")
-                name = "" if part == path else part.relative_to(path).as_posix()
-                total.update(f"{name} {one.hexdigest()}\n".encode())
-    except OSError as error:
-        raise unreadable(path, error) from error
-    return total.hexdigest()
 
 
 def _path_of(source: str | os.PathLike, task: str) -> pathlib.Path:

@@ -10,6 +10,7 @@ Pixels would take a thousand times the space and would not match another machine
 renderer.
 """
 
+import hashlib
 import importlib.metadata
 import json
 import os
@@ -123,6 +124,26 @@ def shipped_path(task: str) -> pathlib.Path:
             "`python -m jaxil.collect`, and set demonstrations.source to the file."
         )
     return path
+
+
+def digest(path: pathlib.Path) -> str:
+    """Returns a digest of the content of a file or folder, whatever its name.
+
+    Raises:
+      DemonstrationError: it cannot be read.
+    """
+    total = hashlib.blake2b(digest_size=16)
+    try:
+        parts = sorted(path.rglob("*")) if path.is_dir() else [path]
+        for part in parts:
+            if part.is_file():
+                with part.open("rb") as file:
+                    one = hashlib.file_digest(file, "blake2b")
+                name = "" if part == path else part.relative_to(path).as_posix()
+                total.update(f"{name} {one.hexdigest()}\n".encode())
+    except OSError as error:
+        raise unreadable(path, error) from error
+    return total.hexdigest()
 
 
 def write_states(path: str | os.PathLike, demonstrations: StateDemonstrations) -> None:

@@ -57,7 +57,7 @@ class Distraction:
 
     def upload(self) -> None:
         """Hands the background to the GL context, which must exist."""
-        mujoco = importlib.import_module("mujoco")
+        mujoco = _mujoco()
 
         model, contexts = self._physics.model, self._physics.contexts
         with contexts.gl.make_current() as context:
@@ -67,7 +67,7 @@ class Distraction:
 
     def _backgrounds(self) -> list[int]:
         """Returns the textures of sky and floor that are whole squares of RGB."""
-        mujoco = importlib.import_module("mujoco")  # reads MUJOCO_GL
+        mujoco = _mujoco()
 
         model, skybox = self._physics.model, mujoco.mjtTexture.mjTEXTURE_SKYBOX
         planes = model.geom_matid[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE]
@@ -82,7 +82,7 @@ class Distraction:
 
     def _turn_camera(self, yaw: float, roll: float) -> None:
         """Turns the camera about the vertical axis, and about its own."""
-        mujoco = importlib.import_module("mujoco")
+        mujoco = _mujoco()
 
         model, camera = self._physics.model, self._camera
         own = {name: self._own[name][camera] for name in _CAMERA}
@@ -101,6 +101,11 @@ class Distraction:
         own_matrix = own["cam_mat0"].reshape(3, 3)
         matrix = turn_matrix.reshape(3, 3) @ own_matrix @ tilt_matrix.reshape(3, 3)
         model.cam_mat0[camera] = matrix.ravel()
+
+
+def _mujoco() -> Any:
+    """Imports MuJoCo, which reads MUJOCO_GL then; its functions have no types."""
+    return importlib.import_module("mujoco")
 
 
 def _quaternion(angle: float) -> np.ndarray:

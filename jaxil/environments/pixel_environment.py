@@ -12,6 +12,7 @@ from PIL import Image
 from jaxil.replay.stacking import gather_stacks
 
 _UNBOUNDED = 1e9  # MuJoCo's value for an actuator without limits
+_USUAL_FRAMES = 1000  # of an episode in dm_control
 
 
 class PixelEnvironment(dm_env.Environment):
@@ -38,6 +39,7 @@ class PixelEnvironment(dm_env.Environment):
         image_size: int,
         frame_stack: int,
         observation: str,
+        max_episode_frames: int = 0,
     ):
         """Wraps `simulator`, a dm_env.Environment; arguments as for `make_environment`.
 
@@ -48,6 +50,11 @@ class PixelEnvironment(dm_env.Environment):
         self._action_repeat = action_repeat
         self.image_size = image_size
         self._renders = observation == "pixels"
+        limit = self.step_limit or math.inf
+        if not max_episode_frames and math.isinf(limit):
+            max_episode_frames = _USUAL_FRAMES
+        self._frame_limit = min(limit, max_episode_frames or limit)
+        self._frames_played = 0
         self._next_episode = 0
         self._reset_next_step = True
         self._seen: Any = None  # the task's own newest observation
@@ -99,7 +106,7 @@ class PixelEnvironment(dm_env.Environment):
         seeds = np.random.SeedSequence([self._seed, episode])
         self._seen = self._restart(seeds.generate_state(8)).observation
         self._next_episode = episode + 1
-        self._reset_next_step = False
+        self._reset_next_step, self._frames_played = False, 0
         self._current, self._frames = None, []
         return dm_env.restart(self._observe())
 
@@ -123,7 +130,8 @@ class PixelEnvironment(dm_env.Environment):
             self._seen = inner.observation
             reward += float(inner.reward)
             discount *= float(inner.discount)
-            is_last = inner.last()
+            self._frames_played += 1
+            is_last = inner.last() or self._frames_played >= self._frame_limit
             if is_last:
                 break
         self._reset_next_step = is_last
@@ -174,12 +182,9 @@ class PixelEnvironment(dm_env.Environment):
         return getattr(self._simulator, "step_limit", None)
 
     @property
-    def episode_steps(self) -> int | None:
-        """Agent steps of a whole episode; None without a time limit."""
-        limit = self.step_limit
-        if limit is None or math.isinf(limit):
-            return None
-        return math.ceil(limit / self._action_repeat)
+    def episode_steps(self) -> int:
+        """Agent steps of a whole episode."""
+        return math.ceil(self._frame_limit / self._action_repeat)
 
     @property
     def decision_seconds(self) -> float | None:

@@ -190,6 +190,7 @@ def make_environment(
     observation: str = "pixels",
     camera: str = "",
     distraction: str = "none",
+    max_episode_frames: int = 0,
 ) -> SuiteEnvironment:
     """Makes the environment of `task`.
 
@@ -203,6 +204,7 @@ def make_environment(
       observation: "pixels" or "state".
       camera: its name or index; "" for the one of DrQ-v2.
       distraction: one of `distraction.STRENGTHS`.
+      max_episode_frames: longest episode; 0 for the task's limit, or 1000 without one.
 
     Raises:
       ValueError: one of these is unknown or out of range.
@@ -235,6 +237,7 @@ def make_environment(
         render_quality=render_quality,
         camera=camera,
         distraction=distraction,
+        max_episode_frames=max_episode_frames,
     )
 
 

@@ -1,7 +1,8 @@
 """A progress line: position, speed and time left."""
 
+import contextlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import TextIO
 
 from jaxil.machine.screen import LastingStream
@@ -125,6 +126,21 @@ class ProgressLine:
         if speed > 0 and not task.finished:
             parts.append(f"{duration((task.remaining or 0.0) / speed)} left")
         return " | ".join(parts)
+
+
+@contextlib.contextmanager
+def shown(label: str, unit: str = "images") -> Iterator[Callable[[int, int], None]]:
+    """Yields a function (done, all) that shows a progress line in this block."""
+    with contextlib.ExitStack() as stack:
+        lines: list[ProgressLine] = []
+
+        def show(done: int, total: int) -> None:
+            if not lines:
+                line = ProgressLine(total, first_frame=done, label=label, unit=unit)
+                lines.append(stack.enter_context(contextlib.closing(line)))
+            lines[0].update(done, {})
+
+        yield show
 
 
 def duration(seconds: float) -> str:

@@ -19,7 +19,7 @@ from jaxil.environments.suite import known_tasks
 from jaxil.environments.tasks import make_environment
 from jaxil.errors import Fault, UsageError
 from jaxil.machine import memory
-from jaxil.machine.progress import ProgressLine
+from jaxil.machine.progress import shown
 from jaxil.native import build
 from jaxil.replay.replay import Replay
 from jaxil.training.agent import native_fault, stack_size
@@ -163,6 +163,7 @@ def _environment_settings(config: Config) -> dict[str, Any]:
         "observation": config.observation,
         "camera": config.camera,
         "distraction": config.distraction,
+        "max_episode_frames": config.max_episode_frames,
     }
 
 
@@ -179,17 +180,7 @@ def load_demonstrations(
     """
     if not jaxil_config.uses_demonstrations(config):
         return None
-    lines: list[ProgressLine] = []
-
-    def show(done: int, total: int) -> None:
-        if not lines:
-            label = "rendering the demonstrations, once"
-            lines.append(
-                ProgressLine(total, first_frame=done, label=label, unit="images")
-            )
-        lines[0].update(done, {})
-
-    try:
+    with shown("rendering the demonstrations, once") as show:
         return loading.load(
             config.demonstrations.source,
             render_quality=config.render_quality,
@@ -198,9 +189,6 @@ def load_demonstrations(
             progress=show,
             **_file_settings(config),
         )
-    finally:
-        for line in lines:
-            line.close()
 
 
 def _file_settings(config: Config) -> dict[str, Any]:

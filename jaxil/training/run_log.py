@@ -1,6 +1,7 @@
 """What a run shows of itself: tables, events, learning curve, videos."""
 
 import io
+import math
 import pathlib
 import time
 from collections.abc import Mapping
@@ -247,7 +248,8 @@ class _Events:
         values = [
             {"tag": f"{group}/{column}", "simple_value": float(value)}
             for column, value in row.items()
-            if column != "frame"
+            # Of metrics that do not exist yet, such as before the first update.
+            if column != "frame" and math.isfinite(value)
         ]
         self._write(step=int(row["frame"]), summary={"value": values})
 

@@ -78,6 +78,10 @@ class Policy:
         actions = np.asarray(self._act(self.params.encoder, self.params.actor, batch))
         return actions[0] if is_single else actions
 
+    def make_environment(self, seed: int = 0) -> PixelEnvironment:
+        """Returns the task as the policy was trained on it."""
+        return assembly.environment_with_seed(self.config, seed)
+
     def description(self) -> str:
         """Returns a few words on the training."""
         config = self.config
@@ -101,7 +105,7 @@ def load_policy(folder: str | os.PathLike) -> Policy:
     """
     devices.device_name()  # a wrong JAX_PLATFORMS is said first
     folder = pathlib.Path(folder).expanduser()
-    config = workdir.read_config(folder)
+    config = workdir.read_config(folder, imports_task=False)
     faults = jaxil_config.problems(config, known_tasks=(config.task,))
     if faults:
         raise UsageError(f"{folder / 'config.json'}: {'; '.join(map(str, faults))}")
@@ -110,7 +114,12 @@ def load_policy(folder: str | os.PathLike) -> Policy:
     except CheckpointError as error:
         raise UsageError(str(error)) from error
     if config.encoder.subtract_mean_image and mean is None:  # of an earlier version
-        mean = agents.mean_image(config, assembly.load_demonstrations(config))
+        try:
+            mean = agents.mean_image(config, assembly.load_demonstrations(config))
+        except DemonstrationError as error:
+            raise UsageError(
+                f"the checkpoint has no mean image, and {error}"
+            ) from error
     head = params["actor"]["params"]["head"]
     (action_dim,) = head["output"]["bias"].shape
     networks = agents.make_networks(config, action_dim, 0.5 if mean is None else mean)
@@ -135,6 +144,7 @@ def load(folder: str | os.PathLike) -> Trained:
     Raises:
       UsageError: see `load_policy`.
     """
+    workdir.read_config(pathlib.Path(folder))  # whose task is imported below
     policy = load_policy(folder)
     config, demonstrations = policy.config, None
     try:

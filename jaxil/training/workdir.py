@@ -11,7 +11,7 @@ from typing import Any
 from jaxil import config as jaxil_config
 from jaxil import outside
 from jaxil.config import Config, default_config
-from jaxil.demonstrations import loading
+from jaxil.demonstrations import states
 from jaxil.demonstrations.states import DemonstrationError
 from jaxil.environments import tasks
 from jaxil.errors import Fault, UsageError, printable
@@ -161,7 +161,7 @@ def newest_checkpoint(workdir: pathlib.Path) -> int | None:
     return max((int(match[1]) for match in matches), default=None)
 
 
-def read_config(workdir: pathlib.Path) -> Config:
+def read_config(workdir: pathlib.Path, *, imports_task: bool = True) -> Config:
     """Returns the config of the run in a folder, whoever wrote it.
 
     Fields that did not exist when it was written have their defaults: these are what
@@ -177,7 +177,7 @@ def read_config(workdir: pathlib.Path) -> Config:
         method, task = str(stored["method"]), str(stored["task"])
         if ":" in method:
             outside.require_trusted(method, "method", path)
-        if tasks.names_code(task):
+        if imports_task and tasks.names_code(task):
             outside.require_trusted(task, "task", path)
         config = default_config(method, task)
         known = jaxil_config.fields(stored["method"])
@@ -218,7 +218,9 @@ def write_config(
 def demonstrations_digest(config: Config) -> str | None:
     """Returns a digest of what the demonstrations' file holds; None if unreadable."""
     try:
-        return loading.digest(config.demonstrations.source, config.task)
+        source = config.demonstrations.source
+        path = pathlib.Path(source) if source else states.shipped_path(config.task)
+        return states.digest(path.expanduser())
     except DemonstrationError:
         return None
 

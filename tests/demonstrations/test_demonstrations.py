@@ -5,6 +5,7 @@ import logging
 import os
 import pathlib
 import zipfile
+from typing import Any
 
 import numpy as np
 import pytest
@@ -329,6 +330,20 @@ def test_files_that_break_the_rules_are_refused(path, name):
     assert text.startswith(str(path))
     assert text.count("\n") == 0
     assert "jaxil.collect" in text
+
+
+@pytest.mark.parametrize(
+    "field", ["format", "version", "task", "camera", "seed", "returns", "versions"]
+)
+def test_text_of_a_file_is_made_harmless(path, field):
+    hostile: Any = "\x1b]0;owned\a\u202e\n" * 10_000
+    if field in ("returns", "versions"):
+        hostile = [hostile]
+    tampered(path, lambda arrays: set_metadata(arrays, **{field: hostile}))
+    with pytest.raises(DemonstrationError) as caught:
+        states.read_states(path, task=TASK)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 2500
 
 
 def test_a_file_cut_off_anywhere_is_refused(path):

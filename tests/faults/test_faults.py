@@ -21,6 +21,6 @@ def test_a_sample_holds(name, tmp_path):
     count = max(_SAMPLES.get(name, 0), round(_SHARE * kind.full_count))
     if not count:
         pytest.skip("set JAXIL_FAULTS=0.02, for that share of the full number")
-    outcomes = list(kind.run(tmp_path, count, seed=1))
+    outcomes = list(kind.run(tmp_path, count, 1))
     assert len(outcomes) == count
     assert [outcome for outcome in outcomes if outcome] == []

@@ -8,6 +8,7 @@ import sys
 
 import pytest
 
+from jaxil.errors import Fault, UsageError
 from jaxil.machine import screen
 from jaxil.machine.progress import ProgressLine
 from jaxil.machine.signals import StopOnSignals
@@ -26,11 +27,24 @@ def test_a_closed_stream_is_given_up(tmp_path, monkeypatch):
     line.close()
 
 
+def test_text_from_files_cannot_command_the_terminal(capsys):
+    hostile = "name\x1b[2J\r\x9b31m" + 10_000 * "x"
+    screen.say(f"first {hostile}\nsecond")
+    fault = Fault("method", "is unknown", value=hostile)
+    for error in (UsageError(fault), UsageError([fault, hostile])):
+        print(error, file=sys.stderr)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[1] == "second"
+    assert len(lines) == 6
+    assert all(line.isprintable() and len(line) < 5000 for line in lines)
+
+
 @pytest.mark.parametrize("ending", ["closed pipe", "full disk"])
 def test_a_process_trains_on_when_nobody_reads(ending):
     # Also what others print to the same stream then, and the flush at the exit.
     program = """
 import sys
+from jaxil.errors import Fault, UsageError
 from jaxil.machine import screen
 from jaxil.machine.progress import ProgressLine
 screen.say("begins")

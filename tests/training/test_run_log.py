@@ -54,13 +54,14 @@ def write_evaluation(outputs, frame=1000):
 def test_tables_events_and_curve(make_outputs, tmp_path):
     outputs = make_outputs(tmp_path)
     write_episode(outputs)
+    outputs.updates(frame=1000, seconds=11.0, metrics={"actor/loss": float("nan")})
     line = write_evaluation(outputs)
 
     assert line.startswith("frame 1000: task return 20.0 ± 10.0; the actor saturates")
     train = read_csv(tmp_path / "train.csv")
     assert list(train) == list(run_log.TRAIN_COLUMNS)
-    assert train["task_return"] == [12.5]
-    assert train["frames_per_second"] == [100.0]
+    assert train["task_return"][0] == 12.5
+    assert train["frames_per_second"][0] == 100.0
     evaluations = read_csv(tmp_path / "eval.csv")
     assert list(evaluations) == list(run_log.EVAL_COLUMNS)
     assert evaluations["wasserstein_to_expert"] == [0.5]
@@ -69,6 +70,7 @@ def test_tables_events_and_curve(make_outputs, tmp_path):
     content = events.read_bytes()
     for tag in (b"train/task_return", b"eval/task_return_mean", b"train/critic/loss"):
         assert tag in content
+    assert b"actor/loss" not in content  # of no update yet: it has no number
 
 
 def test_damaged_tables_do_not_stop_a_resumed_run(make_outputs, tmp_path, capsys):

@@ -1,0 +1,76 @@
+"""What README and CONTRIBUTING tell people to type is understood."""
+
+import importlib
+import re
+import shlex
+
+import pytest
+
+from jaxil import __main__, command
+from tests.commands import ROOT
+
+_BLOCK = re.compile(r"```(\w+)\n(.*?)```", re.DOTALL)
+README = (ROOT / "README.md").read_text()
+
+
+def _blocks(language: str) -> list[str]:
+    return [text for name, text in _BLOCK.findall(README) if name == language]
+
+
+def _typed() -> list[str]:
+    lines = "\n".join(_blocks("sh")).replace("\\\n", " ").splitlines()
+    return [line.strip() for line in lines if line.strip()]
+
+
+class _Understood(Exception):
+    pass
+
+
+@pytest.fixture(name="only_parsed")
+def _only_parsed(monkeypatch):
+    """Ends each command when its command line has been read without a fault."""
+    parse = command.parse
+
+    def parse_and_end(*arguments):
+        parse(*arguments)
+        raise _Understood
+
+    monkeypatch.setattr(command, "parse", parse_and_end)
+    monkeypatch.chdir(ROOT)
+
+
+@pytest.mark.parametrize("line", _typed())
+def test_a_command_is_understood(line, only_parsed):
+    words = [w for w in shlex.split(line, comments=True) if w not in ("[", "]")]
+    program = words[0].rpartition("/")[2]
+    if program == "bash":
+        assert (ROOT / words[1]).is_file()
+    elif program in ("pip", "python3.11"):
+        assert not re.search(r"jaxil\[", line)  # no index has it
+    else:
+        if program == "jaxil":
+            main = __main__.main
+        elif words[1] == "-m":
+            main, words = importlib.import_module(words[2]).main, words[2:]
+        else:
+            assert (ROOT / words[1]).is_file()
+            main, words = importlib.import_module("jaxil.sweep").main, words[1:]
+        with pytest.raises(_Understood):
+            main(words)
+
+
+@pytest.mark.parametrize("text", _blocks("python"))
+def test_an_example_names_what_exists(text):
+    compile(text, "README", "exec")
+    for module, name in re.findall(r"from (jaxil[.\w]*) import (\w+)", text):
+        assert importlib.util.find_spec(f"{module}.{name}") or hasattr(
+            importlib.import_module(module), name
+        )
+    for module, name in re.findall(r"\b(jaxil)\.(\w+)\(", text):
+        assert hasattr(importlib.import_module(module), name)
+
+
+def test_files_that_are_linked_exist():
+    links = re.findall(r"\]\((?!http)([^)#]+)", README)
+    assert links
+    assert [link for link in links if not (ROOT / link).exists()] == []
