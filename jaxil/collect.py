@@ -202,6 +202,8 @@ def _inspect(values: flags.FlagValues) -> None:
             image_size=values.image_size or _INSPECTED_SIZE,
             render_quality=values.render_quality,
             max_bytes=memory.spare_bytes(),
+            camera=values.camera or "",
+            frame_skip=values.frame_skip,
         )
     name = path.resolve().stem
     # Never the input itself, which may be a video in this folder.
@@ -332,7 +334,7 @@ def _define(values: flags.FlagValues) -> None:
         flag_values=values,
     )
     text("camera", help="of a LeRobot dataset with several")
-    number("frame_skip", 1, "--convert keeps every N-th frame of pixels", 1, 10_000)
+    number("frame_skip", 1, "keeps every N-th frame of pixels", 1, 10_000)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from typing import Any
 import ml_collections
 
 from jaxil import methods, outside
+from jaxil.demonstrations.settings import DEMONSTRATIONS
 from jaxil.errors import Fault, UsageError, unknown_name
 from jaxil.methods import Field
 from jaxil.replay import replay
@@ -116,38 +117,7 @@ FIELDS: dict[str, Field] = {
         "auto: native where possible; see `jaxil.native.build`",
         choices=("auto", "native", "xla"),
     ),
-    "demonstrations.source": Field("", "a file or folder; empty: the shipped file"),
-    "demonstrations.num_episodes": Field(
-        10,
-        "1, 10 or 50 in the paper; 10 takes fewer from a source of your own that "
-        "has fewer",
-        1,
-        10**6,
-    ),
-    "demonstrations.frame_skip": Field(
-        1, "keeps every n-th frame of a pixel file", 1, 10**4
-    ),
-    "demonstrations.sampling": Field(
-        "frames",
-        "of pixel files; time: the frame nearest to each agent step, by the file's "
-        "frame rate or action repeat",
-        choices=("frames", "time"),
-    ),
-    "demonstrations.fit": Field(
-        "stretch",
-        "how frames that are not square become so: stretch, crop to the middle, or "
-        "pad with black",
-        choices=("stretch", "crop", "pad"),
-    ),
-    "demonstrations.action_repeat": Field(
-        0, "environment frames of a stored step, if a pixel file lacks it", 0, 1000
-    ),
-    "demonstrations.camera": Field("", "of a LeRobot dataset with several"),
-    "demonstrations.distraction": Field(
-        "none",
-        "as `distraction`, for demonstrations of simulator states",
-        choices=("none", "easy", "medium", "hard"),
-    ),
+    **{f"demonstrations.{name}": field for name, field in DEMONSTRATIONS.items()},
     # Speed.
     "replay_on_device": Field(
         False,

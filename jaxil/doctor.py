@@ -192,17 +192,17 @@ def demonstrations(config: Any) -> Iterator[Finding]:
 
 def _render(task: str, image_size: int, quality: str) -> tuple[str, float]:
     """Returns the GL renderer's name and the milliseconds of one image."""
-    from jaxil.environments import suite
+    from jaxil.environments import tasks
 
-    environment = suite.make_environment(
-        task, seed=0, image_size=image_size, render_quality=quality, observation="state"
+    environment = tasks.make_environment(
+        task, seed=0, image_size=image_size, render_quality=quality
     )
     with contextlib.closing(environment):
         environment.reset()
         if environment.frame().std() == 0:  # also creates the GL context
             raise RuntimeError("images are blank: try MUJOCO_GL=osmesa")
-        seconds = timeit.timeit(environment.frame, number=_NUM_FRAMES) / _NUM_FRAMES
-        return environment.renderer.gl_name(), 1e3 * seconds
+        seconds = timeit.timeit(environment.render, number=_NUM_FRAMES) / _NUM_FRAMES
+        return environment.renderer_name(), 1e3 * seconds
 
 
 def _judged(what: str, value: str, advice: str, level: str = "warning") -> Finding:

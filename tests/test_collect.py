@@ -142,7 +142,7 @@ def test_pixels_keep_their_size_unless_another_is_asked_for(tmp_path):
 @pytest.mark.parametrize(
     ("flags", "expected"),
     [
-        ([], "exactly one of --workdirs, --inspect, --convert"),
+        ([], "exactly one of --workdirs, --policy, --inspect, --convert"),
         ([], "--output=NAME.npz is missing"),
         (["--inspect=a", "--convert=b", "--output=c"], "given: --inspect, --convert"),
         (["--convert=a"], "--output=NAME.npz is missing"),

@@ -7,8 +7,11 @@ import textwrap
 import numpy as np
 import pytest
 
-from jaxil import collect
-from jaxil.demonstrations import foreign
+from jaxil import collect, outside
+from jaxil.config import default_config
+from jaxil.demonstrations import foreign, states
+from jaxil.errors import UsageError
+from jaxil.training import workdir
 from tests.commands import ROOT, run, small
 
 # A package of one file, as a user would write it: a light that can be pushed around.
@@ -146,7 +149,7 @@ def test_a_task_from_outside_is_recorded_trained_resumed_and_shown(
     assert "the expert's mean" in evaluated.stdout
     reported = run("report", str(workdir.parent), f"--output={tmp_path / 'report'}")
     assert reported.returncode == 0, reported.stderr
-    assert task in (tmp_path / "report" / "report.html").read_text()
+    assert task in (tmp_path / "report" / "index.html").read_text()
 
 
 def test_faults_of_tasks_are_one_message_each(tmp_path):
@@ -162,6 +165,23 @@ def test_faults_of_tasks_are_one_message_each(tmp_path):
         assert words in found[0], found
     assert "dm_control" in _problems("light:make", camera="side")[0]
     del tmp_path
+
+
+@pytest.mark.parametrize("task", ["harm:make", "gymnasium:harm:Harm-v0"])
+def test_a_folder_or_file_alone_makes_python_import_nothing(task, tmp_path):
+    (tmp_path / "harm.py").write_text("raise SystemExit('imported')")
+    config = default_config("zero")
+    config.task = task
+    workdir.write_config(tmp_path, config, {})
+    with pytest.raises(UsageError, match=f"--trust={task}"):
+        workdir.read_config(tmp_path)
+    stored = states.read_states(states.shipped_path("cartpole_swingup"), num_episodes=1)
+    stored = stored._replace(metadata={**stored.metadata, "task": task})
+    states.write_states(tmp_path / "states.npz", stored)
+    with pytest.raises(UsageError, match=f"--trust={task}"):
+        collect.main(["collect", f"--inspect={tmp_path / 'states.npz'}"])
+    outside.trust(task)
+    assert workdir.read_config(tmp_path).task == task
 
 
 def _problems(task, **changes):
@@ -185,6 +205,32 @@ def test_pixels_are_scaled_and_starts_depend_on_seed_and_number_alone():
     assert starts[0].shape == (16, 16, 9)
     np.testing.assert_array_equal(starts[0], starts[2])
     assert not np.array_equal(starts[0], starts[1])
+
+
+def test_environments_of_one_process_render_what_they_would_alone():
+    from jaxil.environments import tasks
+
+    def make(size):
+        task = "gymnasium:InvertedPendulum-v5"
+        environment = tasks.make_environment(task, seed=0, image_size=size)
+        environment.reset(episode=0)
+        return environment
+
+    one = make(24)
+    alone = [one.render()]
+    one.step(np.ones(1))
+    alone.append(one.render())
+    assert alone[0].std() > 0
+    assert not np.array_equal(*alone)
+    one.reset(episode=0)
+    other = make(32)
+    shown = other.render()
+    np.testing.assert_array_equal(one.render(), alone[0])
+    one.step(np.ones(1))
+    np.testing.assert_array_equal(other.render(), shown)
+    other.close()
+    np.testing.assert_array_equal(one.render(), alone[1])
+    one.close()
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw
 
+from jaxil import outside
 from jaxil.demonstrations import foreign, rendering, states
 from jaxil.demonstrations.readers.recording import PixelEpisode, Recording
-from jaxil.environments import suite
+from jaxil.environments import tasks
 from jaxil.errors import printable
 
 NUM_COLUMNS = 8  # images of an episode on the contact sheet
@@ -44,6 +45,8 @@ def inspect(
     path: pathlib.Path,
     *,
     max_bytes: int,
+    camera: str = "",
+    frame_skip: int = 1,
     progress: Callable[[int, int], None] = lambda done, total: None,
     **view: Any,
 ) -> Inspection:
@@ -52,6 +55,8 @@ def inspect(
     Args:
       path: file or folder.
       max_bytes: limit of each unpacked array.
+      camera: of a dataset with several.
+      frame_skip: keeps every n-th frame of pixels.
       progress: called with (done, all): images of states, or episodes of pixels.
       view: `image_size` and `render_quality` for states; videos are shrunk until their
         shorter side is `image_size`.
@@ -64,7 +69,12 @@ def inspect(
     if states.recognises(path):
         return _inspect_states(path, progress, view)
     recording = foreign.open_recording(
-        path, max_bytes=max_bytes, image_size=view["image_size"], keep_aspect=True
+        path,
+        max_bytes=max_bytes,
+        image_size=view["image_size"],
+        keep_aspect=True,
+        camera=camera,
+        frame_skip=frame_skip,
     )
     fps = recording.frames_per_second
     summaries, pictures, video = [], [], np.empty((0, 1, 1, 3), np.uint8)
@@ -103,7 +113,7 @@ def inspect(
 def _inspect_states(
     path: pathlib.Path, progress: Callable[[int, int], None], view: dict[str, Any]
 ) -> Inspection:
-    stored = states.read_states(path)
+    stored = _read_states(path)
     metadata = stored.metadata
     num_episodes, num_steps = stored.rewards.shape
     num_rows = min(num_episodes, _NUM_ROWS)
@@ -139,7 +149,7 @@ def render_recording(path: pathlib.Path, **view: Any) -> Recording:
 
     `view` is `image_size` and `render_quality`. Raises the errors of `inspect`.
     """
-    stored = states.read_states(path)
+    stored = _read_states(path)
 
     def episodes() -> Iterator[PixelEpisode]:
         for index in range(len(stored.rewards)):
@@ -210,7 +220,16 @@ def spaced(num_frames: int) -> np.ndarray:
 
 def _fps(stored: states.StateDemonstrations) -> float:
     metadata = stored.metadata
-    return 1.0 / suite.decision_seconds(metadata["task"], metadata["action_repeat"])
+    seconds, _ = tasks.timing(metadata["task"], metadata["action_repeat"])
+    return 1.0 / seconds if seconds else _DEFAULT_FPS
+
+
+def _read_states(path: pathlib.Path) -> states.StateDemonstrations:
+    """Reads states that are to be rendered, by a task of the user's own if need be."""
+    stored = states.read_states(path)
+    if tasks.names_code(stored.metadata["task"]):
+        outside.require_trusted(stored.metadata["task"], "task", path)
+    return stored
 
 
 def _render(

@@ -108,7 +108,7 @@ def warn_of_expert(
     if rewards is not None and not rewards.any():
         messages.append("shows an expert whose task return is 0.")
     for message in messages:
-        _logger.warning("%s %s", path, message)
+        _logger.warning("%s", printable(f"{path} {message}"))
 
 
 def warn_of_versions(path: pathlib.Path, recorded: dict[str, str]) -> None:

@@ -74,12 +74,6 @@ def camera_of(task: str) -> int:
     return 2 if task.startswith("quadruped_") else 0
 
 
-@functools.cache
-def decision_seconds(task: str, action_repeat: int) -> float:
-    """Returns the simulated duration of an agent step, in seconds."""
-    return _suite().load(*split_task(task)).control_timestep() * action_repeat
-
-
 def simulator_versions() -> dict[str, str]:
     """Returns the versions of the packages that determine physics and pixels."""
     return {

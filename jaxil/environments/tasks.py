@@ -176,6 +176,7 @@ class _Gymnasium(dm_env.Environment):
 
     def render(self) -> Any:
         """Returns the current image."""
+        self._enter_context()
         image = self._inner.render()
         if not self._is_rendered:
             # At the interpreter's end the GL library, which is open now, goes first.
@@ -195,7 +196,22 @@ class _Gymnasium(dm_env.Environment):
     def close(self) -> None:
         """Frees the simulation."""
         atexit.unregister(self.close)
+        viewer = self._enter_context()
+        if viewer is not None:  # else its buffers are freed in another's context
+            viewer.con.free()
         self._inner.close()
+
+    def _enter_context(self) -> Any:
+        """Makes MuJoCo's GL context the current one, and returns its owner or None.
+
+        Gymnasium does so at creation alone: several environments would render black
+        images, or into each other's buffers.
+        """
+        renderer = getattr(self._inner.unwrapped, "mujoco_renderer", None)
+        viewer = getattr(renderer, "viewer", None)
+        if viewer is not None:
+            viewer.make_context_current()
+        return viewer
 
 
 def _spec_of(space: Any) -> Any:

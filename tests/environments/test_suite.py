@@ -207,6 +207,39 @@ def test_qualities_look_different():
     assert 0.0 < difference.mean() < 20.0, "the same scene, drawn in two ways"
 
 
+def test_cameras_are_chosen_by_name_or_number():
+    usual = small("walker_walk").reset(0).observation
+    for camera in ("0", "side"):
+        np.testing.assert_array_equal(
+            small("walker_walk", camera=camera).reset(0).observation, usual
+        )
+    back = small("walker_walk", camera="back").reset(0).observation
+    assert not np.array_equal(back, usual)
+    with pytest.raises(ValueError, match="the task has: 0 side, 1 back"):
+        small("walker_walk", camera="front")
+
+
+def test_distractions_are_fixed_by_seed_and_number_and_grow_with_their_strength():
+    plain = small("walker_walk").reset(0).observation.astype(int)
+    distances = []
+    for strength in ("none", "easy", "medium", "hard"):
+        environment, other = (
+            small("walker_walk", distraction=strength) for _ in range(2)
+        )
+        first = environment.reset(0).observation
+        np.testing.assert_array_equal(other.reset(0).observation, first)
+        distances.append(np.abs(first - plain).mean())
+        if strength != "none":
+            assert not np.array_equal(other.reset(1).observation, first)
+            # The physics are those of the task alone.
+            state = small("walker_walk", observation="state").reset(0).observation
+            seen = small("walker_walk", observation="state", distraction=strength)
+            np.testing.assert_array_equal(seen.reset(0).observation, state)
+    assert distances[0] == 0.0
+    assert distances == sorted(distances)
+    assert distances[1] > 5.0
+
+
 # --- reproducibility ------------------------------------------------------------------
 
 

@@ -58,7 +58,8 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
                     size = wanted_size(stored, options)
                 frames.append(resized(frame, size, options.fit))
                 name = f"{len(frames)} or more frames of {size[1]}x{size[0]} pixels,"
-                options.check_bytes(name, len(frames) * frames[0].nbytes)
+                num_bytes = len(frames) * frames[0].nbytes
+                options.check_bytes(name, num_bytes, "; shrink or skip some")
                 if len(frames) % _FRAMES_PER_SIGN == 0:
                     yield None
             yield PixelEpisode(np.stack(frames), stored_size=stored)

@@ -40,10 +40,10 @@ class ReadOptions(NamedTuple):
     fit: str = "stretch"  # one of `frames.FITS`: how other shapes become squares
     camera: str = ""  # of a dataset with several
 
-    def check_bytes(self, name: str, num_bytes: int) -> None:
+    def check_bytes(self, name: str, num_bytes: int, way_out: str = "") -> None:
         """Raises FormatError for more than `max_bytes`."""
         if num_bytes > self.max_bytes:
-            limit = f"more than the {self.max_bytes} allowed"
+            limit = f"more than the {self.max_bytes} allowed{way_out}"
             raise FormatError(f"has {name} of {num_bytes} bytes, {limit}")
 
 

@@ -96,7 +96,7 @@ def collect(
             shape, stored_size = frame.shape, stored_size or size
             pixels += frame.tobytes()
             what = f"{num_frames + 1} or more frames of {shape[1]}x{shape[0]} pixels,"
-            options.check_bytes(what, len(pixels))
+            options.check_bytes(what, len(pixels), "; skip some with frame_skip")
         num_frames += 1
         if num_frames % _FRAMES_PER_SIGN == 0:
             yield None
