@@ -221,7 +221,7 @@ def test_environments_of_one_process_render_what_they_would_alone():
     one.step(np.ones(1))
     alone.append(one.render())
     assert alone[0].std() > 0
-    assert not np.array_equal(*alone)
+    assert not np.array_equal(alone[0], alone[1])
     one.reset(episode=0)
     other = make(32)
     shown = other.render()
