@@ -15,7 +15,6 @@ from jaxil import methods, outside
 from jaxil.demonstrations.settings import DEMONSTRATIONS
 from jaxil.errors import Fault, UsageError, unknown_name
 from jaxil.methods import Field
-from jaxil.replay import replay
 
 # An ml_collections.ConfigDict, whose fields no type checker can know.
 Config = Any
@@ -222,28 +221,6 @@ def sees_actions(config: Config) -> bool:
     """Returns whether the method reads the expert's actions."""
     sees = methods.get(config.method).sees_actions
     return read(config, sees) if isinstance(sees, str) else sees
-
-
-def memory_bytes(config: Config) -> int:
-    """Returns the bytes of this config's replay when full, for pixels."""
-    return replay.memory_bytes(**_ring_sizes(config), action_dim=8)
-
-
-def device_memory_bytes(config: Config) -> int:
-    """Returns the bytes of the device's copy of the replay's frames, for pixels.
-
-    It is reserved at the start; 0 unless `replay_on_device`.
-    """
-    return replay.frames_bytes(**_ring_sizes(config)) if config.replay_on_device else 0
-
-
-def _ring_sizes(config: Config) -> dict[str, Any]:
-    return {
-        "capacity_steps": config.replay_size_steps,
-        "episode_steps": max(1000 // config.action_repeat, 1),
-        "observation_shape": (config.image_size, config.image_size, 3),
-        "observation_dtype": "uint8",
-    }
 
 
 def problems(config: Config, known_tasks: tuple[str, ...]) -> list[Fault]:

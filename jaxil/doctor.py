@@ -141,8 +141,6 @@ def rendering(config: Any) -> Iterator[Finding]:
 
 def memory(config: Any) -> Iterator[Finding]:
     """Compares the available memory with the size of the full replay."""
-    from jaxil import config as jaxil_config
-
     available = host_memory.available_bytes()
     if available is None:
         yield Finding("warning", "memory", "cannot be determined", "watch it yourself")
@@ -151,8 +149,8 @@ def memory(config: Any) -> Iterator[Finding]:
     if config.observation != "pixels":  # state vectors are small
         yield Finding("ok", "memory", value)
         return
-    needed = jaxil_config.memory_bytes(config)
-    copied = jaxil_config.device_memory_bytes(config)
+    needed = _memory_bytes(config)
+    copied = _device_memory_bytes(config)
     replay = f"the replay of {config.replay_size_steps} steps"
     if copied and devices.device_name().startswith("cpu"):
         replay, needed = f"{replay} and its device copy", needed + copied
@@ -241,6 +239,32 @@ def main(argv: list[str]) -> int:
         print(finding, flush=True)
         num_faults += finding.level == "fault"
     return 1 if num_faults else 0
+
+
+def _memory_bytes(config: Any) -> int:
+    """Returns the bytes of this config's replay when full, for pixels."""
+    from jaxil.replay import replay
+
+    return replay.memory_bytes(**_ring_sizes(config), action_dim=8)
+
+
+def _device_memory_bytes(config: Any) -> int:
+    """Returns the bytes of the device's copy of the replay's frames, for pixels.
+
+    It is reserved at the start; 0 unless `replay_on_device`.
+    """
+    from jaxil.replay import replay
+
+    return replay.frames_bytes(**_ring_sizes(config)) if config.replay_on_device else 0
+
+
+def _ring_sizes(config: Any) -> dict[str, Any]:
+    return {
+        "capacity_steps": config.replay_size_steps,
+        "episode_steps": max(1000 // config.action_repeat, 1),
+        "observation_shape": (config.image_size, config.image_size, 3),
+        "observation_dtype": "uint8",
+    }
 
 
 if __name__ == "__main__":

@@ -18,8 +18,8 @@ from jaxil.training import assembly
 from jaxil.training.parts import Parts, make_parts
 from jaxil.training.run_log import as_floats
 
-# Names of NumPy's random streams: every draw is keyed by (seed, stream, step), so
-# that a resumed run repeats those of an unbroken one without any stored state.
+# NumPy's random streams. Numbers are keyed by (seed, stream, step), so a resumed run
+# repeats those of an unbroken one without a stored state.
 _UNIFORM_ACTIONS, _SAMPLED_BATCHES = 1, 2
 _EXPLORATION_KEY = 2**32 - 2  # a fold_in number that no update has
 
@@ -125,8 +125,7 @@ class Run(Parts):
     def learn(self, num_steps: int) -> None:
         """Counts agent steps and starts the updates that they make due.
 
-        jax only starts them here; the next actions wait for their end, so that the
-        policy of a single environment never lags.
+        jax only starts them here; the next actions wait for their end.
         """
         for _ in range(num_steps):
             before = self.frame

@@ -9,7 +9,7 @@ of it, and what it learns from is sampled here.
 import numpy as np
 
 from jaxil import presets
-from jaxil.demonstrations import loading
+from jaxil.demonstrations import loading, sampling
 from jaxil.environments.evaluation import evaluate
 from jaxil.machine import startup
 from jaxil.training import agent as agents
@@ -43,7 +43,7 @@ def main() -> dict[str, float]:
         replay.add_episode(**episode._replace(rewards=np.asarray(rewards))._asdict())
         for _ in range(NUM_UPDATES):
             batch = replay.sample(rng, config.batch_size)
-            expert = loading.sample(
+            expert = sampling.sample(
                 demonstrations,
                 rng,
                 agent.rewarder.expert_batch_size,

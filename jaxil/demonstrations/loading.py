@@ -1,4 +1,4 @@
-"""Loads demonstrations of any format as the agent observes them, and samples them."""
+"""Loads demonstrations of any format as the agent observes them."""
 
 import functools
 import os
@@ -14,8 +14,6 @@ from jaxil.demonstrations.states import StateDemonstrations, fault, unreadable
 from jaxil.environments import tasks
 from jaxil.environments.interaction import Restorable
 from jaxil.files import archive
-from jaxil.maths.types import ExpertBatch
-from jaxil.replay.stacking import gather_stacks
 
 _WAY_OUT = (
     "Replace it; `python -m jaxil.collect --inspect=FILE` shows what a file holds"
@@ -180,53 +178,6 @@ def load(
     served = {"file": str(path), "action_repeat": action_repeat}
     metadata = {**metadata, **served, "returns": _returns(rewards)}
     return Demonstrations(frames, num_frames, actions, rewards, metadata)
-
-
-def sample(
-    demonstrations: Demonstrations,
-    rng: np.random.Generator,
-    batch_size: int,
-    *,
-    frame_stack: int,
-    successors: bool = False,
-    as_indices: bool = False,
-) -> ExpertBatch:
-    """Samples observations and their actions uniformly from all steps.
-
-    Args:
-      frame_stack: frames in an observation; the first is repeated at the start.
-      successors: whether to add the next observations.
-      as_indices: whether observations are the int32 [B, frame_stack] indices of their
-        frames, oldest first, in all episodes end to end, [K * (N + 1), ...].
-
-    Returns:
-      Observations uint8 [B, H, W, 3 * frame_stack] or float32 [B, S], and actions
-      [B, A]; A is 0 if they are unknown.
-    """
-    num_steps = demonstrations.num_frames - 1  # no action follows the last frame
-    ends = np.cumsum(num_steps)
-    chosen = rng.integers(ends[-1], size=batch_size)
-    episodes = np.searchsorted(ends, chosen, side="right")
-    steps = chosen - (ends - num_steps)[episodes]
-
-    def stacks(times: np.ndarray) -> np.ndarray:
-        ages = np.arange(frame_stack - 1, -1, -1)
-        inside = np.maximum(times[:, None] - ages, 0)
-        first = episodes[:, None] * demonstrations.frames.shape[1]
-        return (first + inside).astype(np.int32)
-
-    actions = (
-        np.zeros((batch_size, 0), np.float32)
-        if demonstrations.actions is None
-        else demonstrations.actions[episodes, steps]
-    )
-    successor = stacks(steps + 1) if successors else None
-    batch = ExpertBatch(stacks(steps), actions, successor)
-    if as_indices:
-        return batch
-    # All episodes end to end, without a copy.
-    frames = demonstrations.frames.reshape(-1, *demonstrations.frames.shape[2:])
-    return batch.map_observations(lambda each: gather_stacks(frames, each))
 
 
 def _path_of(source: str | os.PathLike, task: str) -> pathlib.Path:

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxil import methods
 from jaxil.config import Config
-from jaxil.demonstrations import loading
+from jaxil.demonstrations import loading, sampling
 from jaxil.learner.gathering import Frames
 from jaxil.learner.state import TrainState
 from jaxil.maths.types import Batch, ExpertBatch, ExpertEpisodes, Metrics
@@ -162,7 +162,7 @@ class Updates:
         if not rewarder.expert_batch_size:
             return batch, None
         assert self._demonstrations is not None
-        expert = loading.sample(
+        expert = sampling.sample(
             self._demonstrations,
             rng,
             rewarder.expert_batch_size,

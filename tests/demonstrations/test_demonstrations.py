@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxil.demonstrations import loading, rendering, states
+from jaxil.demonstrations import loading, rendering, sampling, states
 from jaxil.demonstrations.states import DemonstrationError, StateDemonstrations
 from jaxil.environments.suite import make_environment
 from jaxil.files import archive
@@ -141,7 +141,7 @@ def test_samples_are_stacks_of_one_episode_with_their_actions(batch_size, frame_
     loaded = loading.Demonstrations(
         frames.astype(np.uint8), np.array([6, 6]), actions, actions[..., 0], {}
     )
-    observation, action, successor = loading.sample(
+    observation, action, successor = sampling.sample(
         loaded,
         np.random.default_rng(batch_size),
         batch_size,
@@ -150,7 +150,7 @@ def test_samples_are_stacks_of_one_episode_with_their_actions(batch_size, frame_
     )
     assert successor is not None
     assert successor.shape == observation.shape
-    plain = loading.sample(
+    plain = sampling.sample(
         loaded, np.random.default_rng(batch_size), batch_size, frame_stack=frame_stack
     )
     assert plain.successor is None

@@ -12,7 +12,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from jaxil.demonstrations import foreign, loading
+from jaxil.demonstrations import foreign, loading, sampling
 from jaxil.demonstrations.readers import own
 from jaxil.demonstrations.readers.frames import resized
 from jaxil.demonstrations.readers.recording import (
@@ -231,7 +231,7 @@ def test_samples_come_from_every_own_frame_and_no_filling(path):
         episodes.append(PixelEpisode(frames.copy(), actions))
     write(path, episodes)
     loaded = load(path)
-    observations, actions, _ = loading.sample(
+    observations, actions, _ = sampling.sample(
         loaded, np.random.default_rng(0), 500, frame_stack=2
     )
     newest = observations[:, 0, 0, -1]
@@ -249,7 +249,7 @@ def test_what_only_some_episodes_have_is_left_out(path):
     assert loaded.actions is None
     assert loaded.task_rewards is None
     assert loaded.mean_return() is None
-    sampled, actions, _ = loading.sample(
+    sampled, actions, _ = sampling.sample(
         loaded, np.random.default_rng(0), 4, frame_stack=1
     )
     assert sampled.shape == (4, 8, 8, 3)
