@@ -2,8 +2,8 @@ r"""Evaluates the newest checkpoint of a run: returns, and a video.
 
     jaxil evaluate --workdir=runs/pdac --num_episodes=50
 
-The policy takes its mean action. The run is not changed; the video is written to
-WORKDIR/videos/evaluation.mp4.
+The policy takes its mean action. The run is not changed. A video, WORKDIR/videos/
+evaluation_FRAME.mp4, shows another episode beside the expert's; --gif adds a GIF.
 """
 
 import sys
@@ -13,6 +13,7 @@ from absl import flags
 from jaxil import command
 
 _FIRST_EPISODE = 1_000_000  # none that training evaluates on
+_GIF_FPS = 12.5
 
 
 def main(argv: list[str]) -> None:
@@ -25,8 +26,8 @@ def main(argv: list[str]) -> None:
 
     print(startup.prepare(), file=sys.stderr, flush=True)
     from jaxil.environments.evaluation import evaluate
-    from jaxil.files.video import write_video
-    from jaxil.training import assembly, run_log, trained
+    from jaxil.files import video
+    from jaxil.training import assembly, film, run_log, trained
 
     run = trained.load(folder)
     gl_name = assembly.renderer_name(run.config)
@@ -35,7 +36,6 @@ def main(argv: list[str]) -> None:
         run.act,
         num_episodes=values.num_episodes,
         first_episode=_FIRST_EPISODE,
-        record_video=gl_name != "none",
     )
     for number, task_return in enumerate(evaluation.task_returns):
         print(f"episode {number}: {task_return:.1f}")
@@ -45,21 +45,33 @@ def main(argv: list[str]) -> None:
         f"{evaluation.mean:.1f}, std {evaluation.std:.1f}, minimum {returns.min():.1f},"
         f" maximum {returns.max():.1f}"
     )
-    expert_frames = None
     if run.demonstrations is not None:
         expert_return = run.demonstrations.mean_return()
         if expert_return is not None:
             line += f"; the expert's mean {expert_return:.1f}"
-        if run.demonstrations.frames.ndim == 5:
-            expert_frames = run.demonstrations.frames[0]
     print(line)
-    if evaluation.video is None:
+    if gl_name == "none":
         return
-    path = folder / "videos" / "evaluation.mp4"
-    path.parent.mkdir(exist_ok=True)
-    fps = run_log.frames_per_second(len(evaluation.video))
-    write_video(path, evaluation.video, expert_frames, fps=fps)
-    print(f"video: {path}")
+    shown = film.play(run, values.video_size)
+    frames = [side.frames for side in shown.sides]
+    if frames[0].shape[1:] != frames[-1].shape[1:]:  # pixels of another size
+        frames = frames[:1]
+    stem = folder / "videos" / f"evaluation_{run.act.frame:09d}"
+    stem.parent.mkdir(exist_ok=True)
+    captions = (*shown.captions(), "")[:2]
+    fps = run_log.frames_per_second(len(frames[0]))
+    video.write_video(stem.with_suffix(".mp4"), *frames, fps=fps, labels=captions)
+    print(f"video: {stem.with_suffix('.mp4')}")
+    if values.gif:
+        stride = round(fps / _GIF_FPS)
+        fewer = [each[::stride] for each in frames]
+        texts = tuple(
+            each if isinstance(each, str) else each[::stride] for each in captions
+        )
+        video.write_gif(
+            stem.with_suffix(".gif"), *fewer, fps=fps / stride, labels=texts
+        )
+        print(f"gif: {stem.with_suffix('.gif')}")
 
 
 def _define(values: flags.FlagValues) -> None:
@@ -68,6 +80,10 @@ def _define(values: flags.FlagValues) -> None:
     flags.DEFINE_integer(
         "num_episodes", 10, "episodes to play", 1, 100_000, flag_values=values
     )
+    flags.DEFINE_integer(
+        "video_size", 256, "pixels of a side of the video", 16, 1024, flag_values=values
+    )
+    flags.DEFINE_boolean("gif", False, "also writes a GIF", flag_values=values)
 
 
 if __name__ == "__main__":

@@ -58,10 +58,18 @@ def test_pdac_trains_shows_itself_and_is_evaluated_again(unbroken):
     assert list((unbroken / "videos").glob("*.mp4"))
     assert list((unbroken / "tensorboard").iterdir())
 
-    again = call("evaluate", f"--workdir={unbroken}", "--num_episodes=2")
+    again = call(
+        "evaluate",
+        f"--workdir={unbroken}",
+        "--num_episodes=2",
+        "--video_size=64",
+        "--gif",
+    )
     assert again.returncode == 0, again.stderr
     assert again.stdout.count("episode ") == 2
-    assert (unbroken / "videos" / "evaluation.mp4").stat().st_size > 1_000
+    for suffix in ("mp4", "gif"):
+        (film,) = (unbroken / "videos").glob(f"evaluation_*.{suffix}")
+        assert film.stat().st_size > 1_000
 
     policy = jaxil.load_policy(unbroken)
     rng = np.random.default_rng(0)

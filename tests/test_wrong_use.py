@@ -134,7 +134,7 @@ def test_demonstrations_are_checked_before_anything_starts(tmp_path):
 def test_help_says_what_the_command_does(name):
     finished = call(name, "--help")
     assert finished.returncode == 0
-    assert f"python -m jaxil.{name}" in finished.stdout
+    assert f"jaxil {'train' if name == 'launch' else name} --" in finished.stdout
 
 
 @pytest.mark.parametrize("name", ["evaluate", "collect"])

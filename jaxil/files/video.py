@@ -1,7 +1,7 @@
 """Writes videos of one episode, or of two side by side."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 
 import numpy as np
@@ -11,6 +11,11 @@ from jaxil.files import writing
 _MIN_HEIGHT = 256  # pixels; smaller frames are enlarged by an integer factor
 _GAP = 8  # pixels between the two images
 _CAPTION = 22  # pixels of the strip above them
+_TEXT = (235, 235, 235)
+_GIF_COLOURS = 64
+
+# One text, or one for each frame.
+Caption = str | Sequence[str]
 
 
 def write_video(
@@ -19,7 +24,7 @@ def write_video(
     frames_right: np.ndarray | None = None,
     *,
     fps: float,
-    labels: tuple[str, str] = ("agent", "expert"),
+    labels: tuple[Caption, Caption] = ("agent", "expert"),
 ) -> None:
     """Writes an MP4 of one episode, or of two side by side.
 
@@ -36,24 +41,8 @@ def write_video(
     import av
     import av.error
 
-    sides = [frames_left] if frames_right is None else [frames_left, frames_right]
-    for name, frames in zip(("frames_left", "frames_right"), sides, strict=False):
-        if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8:
-            found = f"{frames.dtype} {frames.shape}"
-            raise ValueError(f"{name} = {found}: expected uint8 [T, H, W, 3]")
-        if not len(frames) or frames.shape[1:] != frames_left.shape[1:]:
-            expected = f"at least one frame of {frames_left.shape[1:]}"
-            raise ValueError(f"{name}.shape = {frames.shape}: expected {expected}")
-    canvas, corners, factor = _canvas(frames_left.shape[1:3], labels[: len(sides)])
-
-    def images() -> Iterator[np.ndarray]:
-        for step in range(max(map(len, sides))):
-            for frames, (row, column) in zip(sides, corners, strict=True):
-                frame = frames[min(step, len(frames) - 1)]
-                big = frame.repeat(factor, axis=0).repeat(factor, axis=1)
-                canvas[row : row + big.shape[0], column : column + big.shape[1]] = big
-            yield canvas
-
+    images = _images(frames_left, frames_right, labels)
+    first = next(images)
     options = {"movflags": "+faststart"}  # browsers play it while it loads
     with writing.replacing(path) as temporary, temporary.open("wb") as file:
         try:
@@ -63,35 +52,74 @@ def write_video(
                     Fraction(fps).limit_denominator(60_000),
                     options={"preset": "veryfast", "crf": "18"},
                 )
-                stream.height, stream.width = canvas.shape[:2]
+                stream.height, stream.width = first.shape[:2]
                 stream.pix_fmt = "yuv420p"  # needs even sizes
-                for image in images():
+                for image in (first, *images):
                     container.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
                 container.mux(stream.encode())
         except av.error.FFmpegError as error:
             raise OSError(f"the video could not be encoded: {error}") from error
 
 
-def _canvas(
-    size: tuple[int, int], labels: tuple[str, ...]
-) -> tuple[np.ndarray, list[tuple[int, int]], int]:
-    """Makes the background with its captions.
+def write_gif(
+    path: str | os.PathLike,
+    frames_left: np.ndarray,
+    frames_right: np.ndarray | None = None,
+    *,
+    fps: float,
+    labels: tuple[Caption, Caption] = ("agent", "expert"),
+) -> None:
+    """Writes what `write_video` would as an animated GIF that repeats for ever."""
+    from PIL import Image
 
-    Returns:
-      The background [H', W', 3] with even sides, the upper left corner (row, column) of
-      each image on it, and the factor by which images are enlarged.
+    first, *rest = (
+        Image.fromarray(image).quantize(_GIF_COLOURS, dither=Image.Dither.NONE)
+        for image in _images(frames_left, frames_right, labels)
+    )
+    with writing.replacing(path) as temporary, temporary.open("wb") as file:
+        first.save(
+            file,
+            "GIF",
+            save_all=True,
+            append_images=rest,
+            duration=round(1000 / fps),
+            loop=0,
+        )
+
+
+def _images(
+    frames_left: np.ndarray,
+    frames_right: np.ndarray | None,
+    labels: tuple[Caption, Caption],
+) -> Iterator[np.ndarray]:
+    """Yields each frame's image, uint8 [H', W', 3] with even sides.
+
+    Raises:
+      ValueError: frames of another type or shape, or of two sizes.
     """
     from PIL import Image, ImageDraw
 
-    factor = max(1, -(-_MIN_HEIGHT // size[0]))
-    height, width = size[0] * factor, size[1] * factor
+    sides = [frames_left] if frames_right is None else [frames_left, frames_right]
+    for name, frames in zip(("frames_left", "frames_right"), sides, strict=False):
+        if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8:
+            found = f"{frames.dtype} {frames.shape}"
+            raise ValueError(f"{name} = {found}: expected uint8 [T, H, W, 3]")
+        if not len(frames) or frames.shape[1:] != frames_left.shape[1:]:
+            expected = f"at least one frame of {frames_left.shape[1:]}"
+            raise ValueError(f"{name}.shape = {frames.shape}: expected {expected}")
+    factor = max(1, -(-_MIN_HEIGHT // frames_left.shape[1]))
+    height, width = (side * factor for side in frames_left.shape[1:3])
     total_height = _CAPTION + height
-    total_width = width * len(labels) + _GAP * (len(labels) - 1)
-    image = Image.new(
-        "RGB", (total_width + total_width % 2, total_height + total_height % 2)
-    )
-    draw = ImageDraw.Draw(image)
-    corners = [(_CAPTION, index * (width + _GAP)) for index in range(len(labels))]
-    for label, (_, column) in zip(labels, corners, strict=True):
-        draw.text((column + 4, 5), label, fill=(235, 235, 235))
-    return np.array(image), corners, factor
+    total_width = width * len(sides) + _GAP * (len(sides) - 1)
+    size = (total_width + total_width % 2, total_height + total_height % 2)
+    for step in range(max(map(len, sides))):
+        canvas = Image.new("RGB", size)
+        draw = ImageDraw.Draw(canvas)
+        for index, (frames, label) in enumerate(zip(sides, labels, strict=False)):
+            column = index * (width + _GAP)
+            frame = Image.fromarray(frames[min(step, len(frames) - 1)])
+            big = frame.resize((width, height), Image.Resampling.NEAREST)
+            canvas.paste(big, (column, _CAPTION))
+            text = label if isinstance(label, str) else label[min(step, len(label) - 1)]
+            draw.text((column + 4, 5), text, fill=_TEXT)
+        yield np.array(canvas)

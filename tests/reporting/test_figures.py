@@ -3,7 +3,7 @@
 import pytest
 
 from jaxil import config as jaxil_config
-from jaxil import methods
+from jaxil import methods, outside
 from jaxil.reporting.figures import FIGURES, Variant, variant_of
 
 EVERY = sorted(
@@ -37,6 +37,7 @@ def test_methods_from_outside_and_missing_ones_have_names(tmp_path, monkeypatch)
         "    methods.Variation('own.size', 1, 'size {}'),))\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
+    outside.trust("outside:METHOD")
     variant = variant_of({"method": "outside:METHOD", "own": {"size": 2}})
     assert (variant.label, variant.slug) == ("Mine, size 2", "outside_METHOD_size_2")
     gone = variant_of({"method": "no/such.module:METHOD", "shift_padding": 0})
