@@ -149,8 +149,8 @@ def memory(config: Any) -> Iterator[Finding]:
     if config.observation != "pixels":  # state vectors are small
         yield Finding("ok", "memory", value)
         return
-    needed = _memory_bytes(config)
-    copied = _device_memory_bytes(config)
+    needed = memory_bytes(config)
+    copied = device_memory_bytes(config)
     replay = f"the replay of {config.replay_size_steps} steps"
     if copied and devices.device_name().startswith("cpu"):
         replay, needed = f"{replay} and its device copy", needed + copied
@@ -241,14 +241,14 @@ def main(argv: list[str]) -> int:
     return 1 if num_faults else 0
 
 
-def _memory_bytes(config: Any) -> int:
+def memory_bytes(config: Any) -> int:
     """Returns the bytes of this config's replay when full, for pixels."""
     from jaxil.replay import replay
 
     return replay.memory_bytes(**_ring_sizes(config), action_dim=8)
 
 
-def _device_memory_bytes(config: Any) -> int:
+def device_memory_bytes(config: Any) -> int:
     """Returns the bytes of the device's copy of the replay's frames, for pixels.
 
     It is reserved at the start; 0 unless `replay_on_device`.

@@ -58,16 +58,14 @@ def main(argv: list[str]) -> None:
         frames = frames[:1]
     stem = folder / "videos" / f"evaluation_{run.act.frame:09d}"
     stem.parent.mkdir(exist_ok=True)
-    captions = (*shown.captions(), "")[:2]
+    captions = shown.captions()
     fps = run_log.frames_per_second(len(frames[0]))
     video.write_video(stem.with_suffix(".mp4"), *frames, fps=fps, labels=captions)
     print(f"video: {stem.with_suffix('.mp4')}")
     if values.gif:
         stride = round(fps / _GIF_FPS)
         fewer = [each[::stride] for each in frames]
-        texts = tuple(
-            each if isinstance(each, str) else each[::stride] for each in captions
-        )
+        texts = [each[::stride] for each in captions]
         video.write_gif(
             stem.with_suffix(".gif"), *fewer, fps=fps / stride, labels=texts
         )

@@ -158,7 +158,7 @@ def test_jax_on_the_cpu_beside_a_device_is_warned_of(monkeypatch):
 
 
 def test_memory_is_compared_with_the_replay(monkeypatch, config):
-    needed = jaxil_config.memory_bytes(config)
+    needed = doctor.memory_bytes(config)
     levels = {}
     for available in (0.5 * needed, needed + 1e9, needed + 4e9):
         monkeypatch.setattr(
@@ -177,9 +177,9 @@ def test_states_take_little_memory(monkeypatch, config):
 
 
 def test_a_copy_on_the_device_is_counted_where_it_lies(monkeypatch, config):
-    plain = jaxil_config.memory_bytes(config)
+    plain = doctor.memory_bytes(config)
     config.replay_on_device = True
-    frames = jaxil_config.device_memory_bytes(config)
+    frames = doctor.device_memory_bytes(config)
     # 150000 steps in 300 episodes of 500: one frame more in each.
     assert frames == 150_300 * 48 * 48 * 3
     monkeypatch.setattr(memory, "available_bytes", lambda: int(plain + 2e9))

@@ -49,6 +49,7 @@ class Dummies:
                 observe=lambda rewarder, *_: rewarder,
                 rewards=self._rewards,
                 rewarder=self.rewarder,
+                mean_image=None,
             ),
             state=self._named(**vars(self.state)),
             counters=counters,

@@ -24,7 +24,7 @@ def write_video(
     frames_right: np.ndarray | None = None,
     *,
     fps: float,
-    labels: tuple[Caption, Caption] = ("agent", "expert"),
+    labels: Sequence[Caption] = ("agent", "expert"),
 ) -> None:
     """Writes an MP4 of one episode, or of two side by side.
 
@@ -36,7 +36,7 @@ def write_video(
       frames_left: uint8 [T, H, W, 3], T >= 1.
       frames_right: uint8 [T', H, W, 3] of the same size, or None.
       fps: frames per second of the video.
-      labels: captions.
+      labels: captions, one for each side.
     """
     import av
     import av.error
@@ -67,7 +67,7 @@ def write_gif(
     frames_right: np.ndarray | None = None,
     *,
     fps: float,
-    labels: tuple[Caption, Caption] = ("agent", "expert"),
+    labels: Sequence[Caption] = ("agent", "expert"),
 ) -> None:
     """Writes what `write_video` would as an animated GIF that repeats for ever."""
     from PIL import Image
@@ -90,7 +90,7 @@ def write_gif(
 def _images(
     frames_left: np.ndarray,
     frames_right: np.ndarray | None,
-    labels: tuple[Caption, Caption],
+    labels: Sequence[Caption],
 ) -> Iterator[np.ndarray]:
     """Yields each frame's image, uint8 [H', W', 3] with even sides.
 
