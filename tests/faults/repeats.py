@@ -100,7 +100,12 @@ def _computation(method: str, convolutions: str) -> Any:
         state, _ = agent.update_step(state, *updates.sample(rng), None)
     batch, stored = updates.sample(rng), replay.episode(0)
     unknown = np.full(runs.STEPS, np.nan, np.float32)
-    episode = Episode(stored.frames, stored.actions, unknown, unknown)
+    # Backwards, so that it is no demonstration: its transport would cost nothing.
+    episode = Episode(stored.frames[::-1].copy(), stored.actions, unknown, unknown)
+    rewarder = agent.observe(state.rewarder, state.params, episode, experts)
+    state = state.replace(rewarder=rewarder)
+    rewards = agent.rewards(rewarder, state.params, episode, experts)
+    assert np.isfinite(rewards).all()
 
     def compute() -> str:
         fresh = jax.tree.map(jax.numpy.copy, state)
