@@ -25,8 +25,11 @@ def main(argv: list[str]) -> None:
     folder = workdir.from_flag(values.workdir)
 
     print(startup.prepare(), file=sys.stderr, flush=True)
+    from jaxil import config as jaxil_config
+    from jaxil.demonstrations.states import DemonstrationError
     from jaxil.environments.evaluation import evaluate
     from jaxil.files import video
+    from jaxil.machine import screen
     from jaxil.training import assembly, film, run_log, trained
 
     run = trained.load(folder)
@@ -45,20 +48,26 @@ def main(argv: list[str]) -> None:
         f"{evaluation.mean:.1f}, std {evaluation.std:.1f}, minimum {returns.min():.1f},"
         f" maximum {returns.max():.1f}"
     )
-    if run.demonstrations is not None:
-        expert_return = run.demonstrations.mean_return()
-        if expert_return is not None:
-            line += f"; the expert's mean {expert_return:.1f}"
+    has_expert = jaxil_config.uses_demonstrations(run.config)
+    if has_expert:
+        try:
+            expert_return = assembly.expert_return(run.config)
+            if expert_return is not None:
+                line += f"; the expert's mean {expert_return:.1f}"
+        except DemonstrationError as error:
+            has_expert = False
+            screen.say(f"without demonstrations: {error}")
     print(line)
     if gl_name == "none":
         return
-    shown = film.play(run, values.video_size)
-    frames = [side.frames for side in shown.sides]
-    if frames[0].shape[1:] != frames[-1].shape[1:]:  # pixels of another size
-        frames = frames[:1]
+    sides = [film.agent_side(run, values.video_size)]
+    if has_expert:
+        size = sides[0].frames.shape[1]
+        expert = assembly.load_shown_expert(run.config, size)
+        sides.append(film.expert_side(run, expert))
+    frames, captions = zip(*sides)
     stem = folder / "videos" / f"evaluation_{run.act.frame:09d}"
     stem.parent.mkdir(exist_ok=True)
-    captions = shown.captions()
     fps = run_log.frames_per_second(len(frames[0]))
     video.write_video(stem.with_suffix(".mp4"), *frames, fps=fps, labels=captions)
     print(f"video: {stem.with_suffix('.mp4')}")

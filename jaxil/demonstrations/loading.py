@@ -45,10 +45,16 @@ class Demonstrations(NamedTuple):
         return float(np.mean(returns)) if returns else None
 
 
-class Reading(NamedTuple):
-    """How a file is read.
+class Wanted(NamedTuple):
+    """What a run needs of its demonstrations, and how a file is read.
 
     Attributes:
+      task: such as "walker_walk".
+      num_episodes: the file's first ones.
+      action_repeat: the agent's; a multiple of the one in a file of states. Rewards of
+        merged steps are summed, and the first action is kept.
+      image_size: height and width of the frames.
+      observation: "pixels" or "state".
       frame_skip: keeps every n-th frame of a file of pixels.
       sampling: of a file of pixels; "time" takes the frame nearest to each agent step.
       fit: one of `frames.FITS`: how frames of other shapes become squares.
@@ -58,6 +64,11 @@ class Reading(NamedTuple):
       max_bytes: memory limit for a file of pixels.
     """
 
+    task: str
+    num_episodes: int = 10
+    action_repeat: int = 2
+    image_size: int = 84
+    observation: str = "pixels"
     frame_skip: int = 1
     sampling: str = "frames"
     fit: str = "stretch"
@@ -68,28 +79,21 @@ class Reading(NamedTuple):
 
 
 def check(
-    source: str | os.PathLike,
-    *,
-    task: str,
-    num_episodes: int,
-    action_repeat: int,
-    image_size: int = 84,
-    observation: str = "pixels",
-    sees_actions: bool = False,
-    **how: Any,
+    source: str | os.PathLike, *, sees_actions: bool = False, **wanted: Any
 ) -> None:
     """Raises what `load` would raise, without rendering anything.
 
-    `sees_actions` tells whether the method needs the expert's actions; for the other
-    arguments see `load`.
+    Args:
+      source: see `load`.
+      sees_actions: whether the method needs the expert's actions.
+      wanted: the fields of `Wanted`.
     """
-    path, read = _path_of(source, task), Reading(**how)
+    request = Wanted(**wanted)
+    task, path = request.task, _path_of(source, request.task)
     if states.recognises(path):
-        _open_states(path, task, num_episodes, action_repeat, read)
+        _open_states(path, request)
         return
-    loaded = _load_pixels(
-        path, task, num_episodes, action_repeat, image_size, observation, read
-    )
+    loaded = _load_pixels(path, request)
     if not sees_actions:
         return
     if loaded.actions is None:
@@ -101,20 +105,27 @@ def check(
         raise fault(path, f"{what}, but {task} needs {needed}", way_out)
 
 
+def returns(source: str | os.PathLike = "", **wanted: Any) -> list[float]:
+    """Returns each episode's task return without rendering; empty if unknown.
+
+    For the arguments and errors see `load`.
+    """
+    request = Wanted(**wanted)
+    path = _path_of(source, request.task)
+    if states.recognises(path):
+        return _returns(_rewards(*_open_states(path, request)))
+    return _load_pixels(path, request).metadata["returns"]
+
+
 def load(
     source: str | os.PathLike = "",
     *,
-    task: str,
-    num_episodes: int = 10,
-    action_repeat: int = 2,
-    image_size: int = 84,
     render_quality: str = "paper",
-    observation: str = "pixels",
     camera: str = "",
     distraction: str = "none",
     cache: bool = True,
     progress: Callable[[int, int], None] | None = None,
-    **how: Any,
+    **wanted: Any,
 ) -> Demonstrations:
     """Loads demonstrations; states are rendered by the agent's own environment.
 
@@ -123,47 +134,42 @@ def load(
     Args:
       source: a file or folder of any format in `foreign.FORMATS`; "" for the task's
         shipped states.
-      num_episodes: loads the file's first ones.
-      action_repeat: the agent's; a multiple of the one in a file of states. Rewards of
-        merged steps are summed, and the first action is kept.
       cache: whether to cache rendered images.
       progress: called with (images done, all images) while rendering.
-      how: see `Reading`.
+      wanted: the fields of `Wanted`; `task` is required.
 
     Raises:
       DemonstrationError: the file cannot be read, is damaged, or does not fit.
     """
-    path, read = _path_of(source, task), Reading(**how)
+    request = Wanted(**wanted)
+    path = _path_of(source, request.task)
     if not states.recognises(path):
-        loaded = _load_pixels(
-            path, task, num_episodes, action_repeat, image_size, observation, read
-        )
+        loaded = _load_pixels(path, request)
         mismatch.warn_of_pixels(
             path,
             loaded.metadata,
             loaded.num_frames,
-            image_size=image_size,
-            task=task,
-            action_repeat=action_repeat,
-            fit=read.fit,
+            image_size=request.image_size,
+            task=request.task,
+            action_repeat=request.action_repeat,
+            fit=request.fit,
         )
-        mismatch.warn_of_expert(path, num_episodes, *loaded[:4])
+        mismatch.warn_of_expert(path, request.num_episodes, *loaded[:4])
         return loaded
-    stored, stride = _open_states(path, task, num_episodes, action_repeat, read)
-    wanted, num_episodes = num_episodes, len(stored.rewards)
+    stored, stride = _open_states(path, request)
     metadata = stored.metadata
     mismatch.warn_of_versions(path, metadata["versions"])
-    num_steps = stored.rewards.shape[1] // stride
-    used = num_steps * stride
+    rewards = _rewards(stored, stride)
+    used = rewards.shape[1] * stride
     try:
         frames = rendering.observe_episodes(
             stored.simulator_states(slice(0, used + 1, stride)),
-            task=task,
+            task=request.task,
             seed=metadata["seed"],
             first_episode=metadata["first_episode"],
-            image_size=image_size,
+            image_size=request.image_size,
             render_quality=render_quality,
-            observation=observation,
+            observation=request.observation,
             camera=camera,
             distraction=distraction,
             cache=cache,
@@ -171,13 +177,13 @@ def load(
         )
     except ValueError as error:
         raise fault(path, f"cannot be rendered ({error})") from error
-    rewards = stored.rewards[:, :used].reshape(num_episodes, num_steps, stride).sum(2)
-    num_frames = np.full(num_episodes, num_steps + 1)
+    num_frames = np.full(len(rewards), rewards.shape[1] + 1)
     actions = stored.actions[:, :used:stride]
-    mismatch.warn_of_expert(path, wanted, frames, num_frames, actions, rewards)
-    served = {"file": str(path), "action_repeat": action_repeat}
+    found = frames, num_frames, actions, rewards
+    mismatch.warn_of_expert(path, request.num_episodes, *found)
+    served = {"file": str(path), "action_repeat": request.action_repeat}
     metadata = {**metadata, **served, "returns": _returns(rewards)}
-    return Demonstrations(frames, num_frames, actions, rewards, metadata)
+    return Demonstrations(*found, metadata)
 
 
 def _path_of(source: str | os.PathLike, task: str) -> pathlib.Path:
@@ -192,23 +198,30 @@ def _returns(task_rewards: np.ndarray | None) -> list[float]:
     return task_rewards.astype(np.float64).sum(axis=1).tolist()
 
 
+def _rewards(stored: StateDemonstrations, stride: int) -> np.ndarray:
+    """Returns the rewards of whole agent steps, each of `stride` stored ones."""
+    count, length = stored.rewards.shape
+    whole = stored.rewards[:, : length // stride * stride]
+    return whole.reshape(count, -1, stride).sum(2)
+
+
 def _open_states(
-    path: pathlib.Path,
-    task: str,
-    num_episodes: int,
-    action_repeat: int,
-    read: Reading,
+    path: pathlib.Path, request: Wanted
 ) -> tuple[StateDemonstrations, int]:
     """Returns a file's content, and the stored steps per agent step."""
+    task, action_repeat = request.task, request.action_repeat
     stored = states.read_states(
-        path, task=task, num_episodes=num_episodes, takes_fewer=read.takes_fewer
+        path,
+        task=task,
+        num_episodes=request.num_episodes,
+        takes_fewer=request.takes_fewer,
     )
     recorded = stored.metadata["action_repeat"]
     if action_repeat < 1 or action_repeat % recorded:
         what = f"was recorded with action_repeat={recorded}, not {action_repeat}"
         raise fault(path, what, f"Use a multiple of {recorded}, or record it again")
-    if read.frame_skip != 1:
-        what = f"holds states, but frame_skip={read.frame_skip} is for pixels"
+    if request.frame_skip != 1:
+        what = f"holds states, but frame_skip={request.frame_skip} is for pixels"
         raise fault(path, what, "Set demonstrations.frame_skip to 1")
     stride = action_repeat // recorded
     if stride > stored.rewards.shape[1]:
@@ -225,37 +238,31 @@ def _open_states(
     return stored, stride
 
 
-def _load_pixels(path: pathlib.Path, *request: Any) -> Demonstrations:
+def _load_pixels(path: pathlib.Path, request: Wanted) -> Demonstrations:
     """Reads a file of pixels, or returns it again if it was the last one read."""
     try:
         parts = sorted(path.rglob("*")) if path.is_dir() else [path]
         stamps = tuple((str(part), part.stat().st_mtime_ns) for part in parts)
     except OSError as error:
         raise unreadable(path, error) from error
-    return _read_pixels(path, stamps, *request)
+    return _read_pixels(path, stamps, request)
 
 
 # `check` and `load` share one reading. The run keeps these pixels in memory anyway.
 @functools.lru_cache(maxsize=1)
 def _read_pixels(
-    path: pathlib.Path,
-    stamps: tuple[tuple[str, int], ...],
-    task: str,
-    num_episodes: int,
-    action_repeat: int,
-    image_size: int,
-    observation: str,
-    how: Reading,
+    path: pathlib.Path, stamps: tuple[tuple[str, int], ...], request: Wanted
 ) -> Demonstrations:
     del stamps  # part of the key only
-    if observation != "pixels":
-        what = f"holds pixels or is damaged, but observation={observation!r}"
+    task, num_episodes, skip = request.task, request.num_episodes, request.frame_skip
+    action_repeat = request.action_repeat
+    if request.observation != "pixels":
+        what = f"holds pixels or is damaged, but observation={request.observation!r}"
         raise fault(path, what, "Set observation to 'pixels', or use a file of states")
-    skip = how.frame_skip
     if num_episodes < 1 or skip < 1:
         what = f"does not fit num_episodes={num_episodes} and frame_skip={skip}"
         raise fault(path, what, "Both must be at least 1")
-    by_time = how.sampling == "time"
+    by_time = request.sampling == "time"
     if by_time and skip > 1:
         what = f"is sampled by time, but demonstrations.frame_skip={skip}"
         raise fault(path, what, "Set one of the two")
@@ -275,13 +282,13 @@ def _read_pixels(
         read = foreign.read_episodes(
             path,
             num_episodes=num_episodes,
-            image_size=image_size,
-            max_bytes=how.max_bytes,
-            takes_fewer=how.takes_fewer,
+            image_size=request.image_size,
+            max_bytes=request.max_bytes,
+            takes_fewer=request.takes_fewer,
             frame_skip=skip,
-            fit=how.fit,
-            camera=how.dataset_camera,
-            action_repeat=how.stated_action_repeat,
+            fit=request.fit,
+            camera=request.dataset_camera,
+            action_repeat=request.stated_action_repeat,
             frames_per_step=frames_per_step if by_time else None,
         )
     except OSError as error:

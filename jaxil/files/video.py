@@ -1,5 +1,6 @@
 """Writes videos of one episode, or of two side by side."""
 
+import itertools
 import os
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
@@ -54,7 +55,7 @@ def write_video(
                 )
                 stream.height, stream.width = first.shape[:2]
                 stream.pix_fmt = "yuv420p"  # needs even sizes
-                for image in (first, *images):
+                for image in itertools.chain([first], images):
                     container.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
                 container.mux(stream.encode())
         except av.error.FFmpegError as error:
@@ -72,16 +73,17 @@ def write_gif(
     """Writes what `write_video` would as an animated GIF that repeats for ever."""
     from PIL import Image
 
-    first, *rest = (
+    images = (
         Image.fromarray(image).quantize(_GIF_COLOURS, dither=Image.Dither.NONE)
         for image in _images(frames_left, frames_right, labels)
     )
+    first = next(images)
     with writing.replacing(path) as temporary, temporary.open("wb") as file:
         first.save(
             file,
             "GIF",
             save_all=True,
-            append_images=rest,
+            append_images=images,  # pyright: ignore[reportArgumentType]
             duration=round(1000 / fps),
             loop=0,
         )

@@ -25,7 +25,7 @@ from jaxil.replay.replay import Replay
 from jaxil.training.agent import native_fault, stack_size
 
 # Added to the seed for what must not share its random starts with training.
-_EVALUATION_SEED = 1_000_003
+EVALUATION_SEED = 1_000_003
 # With a fault in one of these, the demonstrations are not opened.
 _READING_FIELDS = {
     "method",
@@ -105,7 +105,7 @@ def training_environment(config: Config) -> PixelEnvironment:
 
 def evaluation_environment(config: Config) -> PixelEnvironment:
     """Returns a separate environment, with starts that training does not use."""
-    return environment_with_seed(config, config.seed + _EVALUATION_SEED)
+    return environment_with_seed(config, config.seed + EVALUATION_SEED)
 
 
 def environment_with_seed(config: Config, seed: int) -> PixelEnvironment:
@@ -184,8 +184,33 @@ def load_demonstrations(config: Config) -> loading.Demonstrations | None:
         )
 
 
+def load_shown_expert(config: Config, image_size: int) -> loading.Demonstrations:
+    """Returns the first demonstration for people to look at, at quality `paper`.
+
+    Raises:
+      DemonstrationError: the file does not fit this run.
+    """
+    shown_as = {"image_size": image_size, "observation": "pixels", "num_episodes": 1}
+    return loading.load(
+        config.demonstrations.source,
+        camera=config.camera,
+        **(_file_settings(config) | shown_as),
+    )
+
+
+def expert_return(config: Config) -> float | None:
+    """Returns the demonstrations' mean task return; None if unknown.
+
+    Raises:
+      DemonstrationError: the file does not fit this run.
+    """
+    source = config.demonstrations.source
+    found = loading.returns(source, **_file_settings(config))
+    return float(np.mean(found)) if found else None
+
+
 def _file_settings(config: Config) -> dict[str, Any]:
-    """Returns what decides whether a demonstration file can serve a run."""
+    """Returns the fields of `loading.Wanted`."""
     settings = config.demonstrations
     usual = jaxil_config.FIELDS["demonstrations.num_episodes"].default
     return {

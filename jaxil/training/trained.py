@@ -9,13 +9,12 @@ import numpy as np
 
 from jaxil import config as jaxil_config
 from jaxil.config import Config
-from jaxil.demonstrations import loading
 from jaxil.demonstrations.states import DemonstrationError
 from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.errors import UsageError
 from jaxil.learner.policy import make_mean_action
 from jaxil.learner.state import LearnerParams
-from jaxil.machine import devices, screen
+from jaxil.machine import devices
 from jaxil.networks.agent import AgentNetworks
 from jaxil.training import agent as agents
 from jaxil.training import assembly, workdir
@@ -128,28 +127,20 @@ def load_policy(folder: str | os.PathLike) -> Policy:
 
 
 class Trained(NamedTuple):
-    """A learned policy, and what it takes to play and judge it."""
+    """A learned policy, and what it takes to play it."""
 
     config: Config
     act: Policy
     environment: PixelEnvironment  # a separate one, not the training's
-    demonstrations: loading.Demonstrations | None
 
 
 def load(folder: str | os.PathLike) -> Trained:
-    """Returns the policy with an environment, and the run's demonstrations if any.
-
-    Demonstrations that have moved are done without, which is said.
+    """Returns the policy with an environment.
 
     Raises:
       UsageError: see `load_policy`.
     """
     workdir.read_config(pathlib.Path(folder))  # whose task is imported below
     policy = load_policy(folder)
-    config, demonstrations = policy.config, None
-    try:
-        demonstrations = assembly.load_demonstrations(config)
-    except DemonstrationError as error:
-        screen.say(f"without demonstrations: {error}")
-    environment = assembly.evaluation_environment(config)
-    return Trained(config, policy, environment, demonstrations)
+    environment = assembly.evaluation_environment(policy.config)
+    return Trained(policy.config, policy, environment)

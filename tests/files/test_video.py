@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from jaxil.files.video import write_video
+from jaxil.files.video import write_gif, write_video
 from tests.demonstrations.foreign_files import open_video
 
 
@@ -101,3 +102,25 @@ def test_a_failing_encoder_leaves_the_old_file(tmp_path):
         write_video(path, plain_frames(1, (0, 0, 0), (256, 20_000)), fps=10)
     assert path.read_bytes() == b"old"
     assert [item.name for item in tmp_path.iterdir()] == ["video.mp4"]
+
+
+def test_a_gif_shows_the_same_with_a_text_for_each_frame(tmp_path):
+    path = tmp_path / "episode.gif"
+    red, blue = plain_frames(3, (200, 0, 0)), plain_frames(2, (0, 0, 200))
+
+    write_gif(path, red, blue, fps=10, labels=(["a", "b", "a"], "expert"))
+
+    with Image.open(path) as image:
+        assert image.n_frames == 3  # pyright: ignore[reportAttributeAccessIssue]
+        assert image.info["duration"] == 100
+        seen = []
+        for index in range(3):
+            image.seek(index)
+            seen.append(np.asarray(image.convert("RGB")))
+    for frame in seen:
+        np.testing.assert_allclose(
+            frame[22 + 168, 168].astype(int), (200, 0, 0), atol=9
+        )
+        assert frame[22 + 168, 344 + 168, 2] > 190
+    np.testing.assert_array_equal(seen[0], seen[2])
+    assert np.any(seen[0][:22, :336] != seen[1][:22, :336])

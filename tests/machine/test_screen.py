@@ -25,6 +25,7 @@ def test_a_closed_stream_is_given_up(tmp_path, monkeypatch):
     line = ProgressLine(10, stream=closed)
     line.message("nor this")
     line.close()
+    assert (tmp_path / "out").read_text() == ""
 
 
 def test_text_from_files_cannot_command_the_terminal(capsys):

@@ -1,4 +1,4 @@
-"""Entropic transport: closed forms, marginals, and two independent solvers."""
+"""Entropic transport: closed forms, marginals, and plain solvers in float64."""
 
 import functools
 from typing import Any
