@@ -191,11 +191,13 @@ def load_shown_expert(config: Config, image_size: int) -> loading.Demonstrations
       DemonstrationError: the file does not fit this run.
     """
     shown_as = {"image_size": image_size, "observation": "pixels", "num_episodes": 1}
-    return loading.load(
-        config.demonstrations.source,
-        camera=config.camera,
-        **(_file_settings(config) | shown_as),
-    )
+    with shown("rendering the expert's episode, once") as show:
+        return loading.load(
+            config.demonstrations.source,
+            camera=config.camera,
+            progress=show,
+            **(_file_settings(config) | shown_as),
+        )
 
 
 def expert_return(config: Config) -> float | None:

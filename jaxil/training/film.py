@@ -8,6 +8,7 @@ from PIL import Image
 from jaxil.demonstrations import playing, rendering
 from jaxil.demonstrations.loading import Demonstrations
 from jaxil.environments.interaction import Restorable
+from jaxil.machine.progress import shown
 from jaxil.training import assembly
 from jaxil.training.trained import Trained
 
@@ -52,16 +53,18 @@ def agent_side(run: Trained, image_size: int) -> Side:
         frames, rewards = np.asarray(episode.frames), episode.rewards
     else:
         played = playing.play(environment, lambda _: act, 1)
-        (frames,) = rendering.observe_episodes(
-            {name: played[name] for name in ("qpos", "qvel", "act")},
-            task=config.task,
-            seed=config.seed + assembly.EVALUATION_SEED,
-            first_episode=0,
-            image_size=image_size,
-            render_quality="paper",
-            camera=config.camera,
-            cache=False,
-        )
+        with shown("rendering the agent's episode") as show:
+            (frames,) = rendering.observe_episodes(
+                {name: played[name] for name in ("qpos", "qvel", "act")},
+                task=config.task,
+                seed=config.seed + assembly.EVALUATION_SEED,
+                first_episode=0,
+                image_size=image_size,
+                render_quality="paper",
+                camera=config.camera,
+                cache=False,
+                progress=show,
+            )
         (rewards,) = played["rewards"]
         if views:
             _inset(frames, views)
