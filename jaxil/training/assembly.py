@@ -185,7 +185,7 @@ def load_demonstrations(config: Config) -> loading.Demonstrations | None:
 
 
 def load_shown_expert(config: Config, image_size: int) -> loading.Demonstrations:
-    """Returns the first demonstration for people to look at, at quality `paper`.
+    """Returns the first demonstration, large enough for people.
 
     Raises:
       DemonstrationError: the file does not fit this run.
@@ -194,6 +194,7 @@ def load_shown_expert(config: Config, image_size: int) -> loading.Demonstrations
     with shown("rendering the expert's episode, once") as show:
         return loading.load(
             config.demonstrations.source,
+            render_quality=config.render_quality,
             camera=config.camera,
             progress=show,
             **(_file_settings(config) | shown_as),

@@ -29,7 +29,7 @@ class Side(NamedTuple):
 
 
 def agent_side(run: Trained, image_size: int) -> Side:
-    """Plays an episode and renders it at quality `paper`.
+    """Plays an episode and renders it large, at the quality of the run.
 
     What the agent sees is in the lower right corner. A task without simulator states is
     shown as the agent sees it.
@@ -60,7 +60,7 @@ def agent_side(run: Trained, image_size: int) -> Side:
                 seed=config.seed + assembly.EVALUATION_SEED,
                 first_episode=0,
                 image_size=image_size,
-                render_quality="paper",
+                render_quality=config.render_quality,
                 camera=config.camera,
                 cache=False,
                 progress=show,

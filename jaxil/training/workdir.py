@@ -191,7 +191,7 @@ def read_config(workdir: pathlib.Path, *, imports_task: bool = True) -> Config:
     except OSError as error:
         raise UsageError(
             f"workdir={str(workdir)!r} holds no run: {path} is not readable "
-            f"({error.strerror}); give the --workdir of a `jaxil.launch`"
+            f"({error.strerror}); give the --workdir of a `jaxil train`"
         ) from error
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UsageError(
