@@ -25,7 +25,6 @@ from jaxil.demonstrations.readers.recording import (
     naming,
 )
 
-_START = b"\x89HDF\r\n\x1a\n"
 _NAMES = ("observation", "action", "reward", "step_type")
 
 
@@ -69,4 +68,8 @@ def _files(path: pathlib.Path) -> list[pathlib.Path]:
         files = sorted(path.iterdir()) if path.is_dir() else [path]
     except (OSError, ValueError):
         return []
-    return [file for file in files if first_bytes(file, len(_START)) == _START]
+    return [
+        file
+        for file in files
+        if first_bytes(file, len(minari.HDF5_START)) == minari.HDF5_START
+    ]

@@ -24,7 +24,7 @@ from jaxil.demonstrations.readers.recording import (
 from jaxil.files.untrusted import require_regular
 
 _DATA, _METADATA = "main_data.hdf5", "metadata.json"
-_HDF5, _JPEG = b"\x89HDF\r\n\x1a\n", b"\xff\xd8\xff"
+HDF5_START, _JPEG = b"\x89HDF\r\n\x1a\n", b"\xff\xd8\xff"
 _FILTERS = {1, 2, 3, 32000}  # gzip, shuffle, fletcher32, lzf: not plug-ins
 _MAX_RATIO = 1100  # of compression; gzip reaches 1032
 
@@ -37,7 +37,7 @@ def recognises(path: pathlib.Path) -> bool:
         return False
     head = first_bytes(folder / _METADATA, 4096)
     is_described = b'"data_format"' in head and b'"total_episodes"' in head
-    return is_described or first_bytes(folder / _DATA, len(_HDF5)) == _HDF5
+    return is_described or first_bytes(folder / _DATA, len(HDF5_START)) == HDF5_START
 
 
 def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
