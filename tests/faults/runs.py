@@ -18,6 +18,7 @@ import threading
 import time
 from collections.abc import Iterator
 from typing import Any
+from unittest import mock
 
 import numpy as np
 
@@ -42,12 +43,20 @@ def make_config(method: str, **changes: Any) -> Any:
 
 def replace_what_is_slow() -> None:
     """Puts the drawing in place of the simulator, in this process."""
-    runs.make_config = make_config
-    assembly.make_environment = lambda *_, **__: runs.Drawing()  # pyright: ignore
-    assembly.Pool = lambda make, size, say: InTurn([make() for _ in range(size)])  # pyright: ignore
-    agents.make_agent = lambda config, *_: runs.make_agent(config.method)
-    learning_curve.plot = lambda *_, **__: None  # pyright: ignore
-    parts.Closeness = lambda *_: _NoDistance()  # pyright: ignore
+
+    def pool(make: Any, size: int, say: Any) -> InTurn:
+        del say
+        return InTurn([make() for _ in range(size)])
+
+    for module, name, fast in [
+        (runs, "make_config", make_config),
+        (assembly, "make_environment", lambda *_, **__: runs.Drawing()),
+        (assembly, "Pool", pool),
+        (agents, "make_agent", lambda config, *_: runs.make_agent(config.method)),
+        (learning_curve, "plot", lambda *_, **__: None),
+        (parts, "ExpertDistance", lambda *_: _NoDistance()),
+    ]:
+        mock.patch.object(module, name, fast).start()  # fails if there is no such name
 
 
 class _NoDistance:
