@@ -3,6 +3,7 @@
 import pathlib
 import re
 import zipfile
+import zlib
 
 import numpy as np
 
@@ -12,14 +13,11 @@ from jaxil.maths.types import Episode
 from jaxil.replay.replay import Replay
 
 _NAME = re.compile(r"episode_(\d{8,})\.npz")
-# The file contains the episode's number, so that swapped files are noticed. Files of
-# earlier versions lack it.
-_NUMBER = "number"
 
 
-def write(folder: pathlib.Path, replay: Replay, index: int) -> None:
-    """Writes one stored episode."""
-    arrays = {**replay.episode(index)._asdict(), _NUMBER: np.int64(index)}
+def write(folder: pathlib.Path, replay: Replay, index: int) -> int:
+    """Writes one stored episode; returns the file's CRC-32."""
+    arrays = replay.episode(index)._asdict()
     # np.savez_compressed uses level 6: far slower, hardly smaller.
     with (
         writing.replacing(_path(folder, index)) as temporary,
@@ -30,24 +28,30 @@ def write(folder: pathlib.Path, replay: Replay, index: int) -> None:
                 np.lib.format.write_array(
                     member, np.asanyarray(array), allow_pickle=False
                 )
+    return zlib.crc32(_path(folder, index).read_bytes())
 
 
-def read_into(replay: Replay, folder: pathlib.Path, index: int) -> str | None:
+def read_into(
+    replay: Replay, folder: pathlib.Path, index: int, checksum: int | None
+) -> str | None:
     """Adds one episode, or skips its number if the file is damaged.
+
+    Args:
+      replay: that the episode is added to.
+      folder: of the files.
+      index: the episode's number.
+      checksum: what `write` returned; None if that is unknown.
 
     Returns:
       What is wrong with the file, or None.
     """
     path = _path(folder, index)
     try:
-        names = Episode._fields
-        if _NUMBER in archive.member_names(path):
-            names = (*names, _NUMBER)
-        limit = archive.MAX_BYTES
-        arrays = archive.read_archive(path, max_bytes=dict.fromkeys(names, limit))
-        number = arrays.pop(_NUMBER, index)
-        if number != index:
-            raise ValueError(f"holds episode {number}")
+        limits = dict.fromkeys(Episode._fields, archive.MAX_BYTES)
+        arrays = archive.read_archive(path, max_bytes=limits)
+        # Zip's own checksums miss a file that was swapped for another.
+        if checksum not in (None, zlib.crc32(path.read_bytes())):
+            raise ValueError("has changed since it was written")
         replay.add_episode(**arrays)
     except (OSError, ValueError) as error:
         replay.skip_episode()

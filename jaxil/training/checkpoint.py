@@ -63,6 +63,7 @@ class Checkpoints:
         self._say = say
         self._last: pathlib.Path | None = None  # saved or restored by this process
         self._num_episodes_saved = 0
+        self._checksums: dict[int, int] = {}  # of episodes' files, where known
         self._oldest_episode: dict[pathlib.Path, int] = {}  # that a checkpoint needs
 
     def newest(self) -> int | None:
@@ -122,7 +123,8 @@ class Checkpoints:
         episodes, added = replay.episodes, replay.num_episodes_added
         for index in episodes:
             if index >= self._num_episodes_saved:
-                episode_files.write(self._replay, replay, index)
+                checksum = episode_files.write(self._replay, replay, index)
+                self._checksums[index] = checksum
         rewards = [replay.rewards(index) for index in episodes]
         record = {
             "counters": counters,
@@ -130,6 +132,7 @@ class Checkpoints:
             "num_episodes": added,
             "episodes": episodes,
             "episode_steps": [len(each) for each in rewards],
+            "episode_checksums": [self._checksums.get(index) for index in episodes],
         }
         path = self._free_path(frame)
         with writing.replacing(path) as temporary:
@@ -226,11 +229,16 @@ class Checkpoints:
         replay.clear(oldest)
         # Earlier versions had no list, because they left no episode out.
         expected = record.get("episodes", list(range(oldest, added)))
+        checksums = record.get("episode_checksums", [None] * len(expected))
+        known = dict(zip(expected, checksums, strict=True))
+        self._checksums = {i: crc for i, crc in known.items() if crc is not None}
         faults = []
         for index in range(oldest, added):
             if index not in expected:
                 replay.skip_episode()
-            elif fault := episode_files.read_into(replay, self._replay, index):
+                continue
+            fault = episode_files.read_into(replay, self._replay, index, known[index])
+            if fault:
                 faults.append(fault)
         if faults:
             more = f" and {len(faults) - 3} more" if len(faults) > 3 else ""
