@@ -364,7 +364,8 @@ def test_a_flipped_bit_in_an_episode_is_noticed(tmp_path, seed):
     fault = episode_files.read_into(restored, tmp_path, 0, checksum)
 
     assert restored.num_episodes_added == 1
-    assert fault is not None and fault.startswith("episode_00000000.npz: ")
+    assert fault is not None
+    assert fault.startswith("episode_00000000.npz: ")
     assert "\n" not in fault
 
 
