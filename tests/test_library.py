@@ -38,22 +38,23 @@ def test_the_package_is_imported_without_jax():
     assert "has no attribute 'nothing'" in _python(script).stderr
 
 
-_STATES = """
+_OBSERVE = """
 from jaxil.environments import suite
-environment = suite.make_environment("cartpole_swingup", seed=0, observation={!r})
-print(environment.reset().observation.shape)
+for observation in {!r}:
+    made = suite.make_environment("cartpole_swingup", seed=0, observation=observation)
+    print(made.reset().observation.shape)
 """
 
 
 def test_environments_need_no_call_before_their_import():
-    made = _python(_STATES.format("pixels"), MUJOCO_GL=None, PYOPENGL_PLATFORM=None)
+    made = _python(_OBSERVE.format(["pixels"]), MUJOCO_GL=None, PYOPENGL_PLATFORM=None)
     assert made.stdout == "(84, 84, 9)\n", made.stderr
 
 
 def test_states_need_no_opengl():
     no_display = {"MUJOCO_GL": "glfw", "DISPLAY": None, "WAYLAND_DISPLAY": None}
-    assert _python(_STATES.format("state"), **no_display).stdout == "(5,)\n"
-    failed = _python(_STATES.format("pixels"), **no_display)
+    failed = _python(_OBSERVE.format(["state", "pixels"]), **no_display)
+    assert failed.stdout == "(5,)\n"
     assert "MUJOCO_GL=glfw does not work here (there is no display)" in failed.stderr
 
 

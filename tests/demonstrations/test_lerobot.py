@@ -397,14 +397,6 @@ def test_more_than_the_limit_is_refused_and_the_limit_itself_is_not(
         read(path, max_bytes=limit)
 
 
-def test_episodes_and_faults_pass_from_one_process_to_the_other(path):
-    recording = foreign.open_recording(path, max_bytes=2**24)
-    assert_same(list(recording.episodes), EPISODES)
-    change_rows(path, DATA_FILE, set_row(4, action=None))
-    with pytest.raises(FormatError, match="action"):
-        list(foreign.open_recording(path, max_bytes=2**24).episodes)
-
-
 def test_frames_of_videos_are_scaled_while_they_are_decoded(path):
     limit = 5 * 4 * 4 * 3  # of the longest episode
     _, episodes = read(path, max_bytes=1000, image_size=4)

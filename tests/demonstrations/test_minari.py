@@ -148,17 +148,6 @@ def test_jpegs_are_read_with_a_note(tmp_path, kind):
     np.testing.assert_array_equal(seen.frames, images)
 
 
-def test_episodes_pass_from_one_process_to_the_other(tmp_path):
-    write = [make_episode(3, size=32), make_episode(2, size=32)]
-    make_minari_dataset(tmp_path / "a", write)
-    recording = foreign.open_recording(tmp_path / "a", max_bytes=2**24)
-    expected, episodes = read(tmp_path / "a")
-    assert recording.notes == expected.notes
-    for episode, other in zip(recording.episodes, episodes, strict=True):
-        for one, two in zip(episode[:3], other[:3], strict=True):
-            np.testing.assert_array_equal(one, two, strict=True)
-
-
 def with_dictionary(*images, num_steps=3):
     episode = make_episode(num_steps)
     space = {name: gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8) for name in images}

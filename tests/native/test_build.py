@@ -83,16 +83,19 @@ build.register(ctypes.CDLL(str(path)))
 
 
 @pytest.mark.usefixtures("quick_compiler")
-@pytest.mark.parametrize("damage", ["empty", "truncated", "flipped"])
-def test_a_damaged_library_is_rebuilt(tmp_path, damage):
+def test_a_damaged_library_is_rebuilt(tmp_path):
     path = build.build(tmp_path)
     whole = path.read_bytes()
     half = len(whole) // 2
     flipped = whole[:half] + bytes([whole[half] ^ 1]) + whole[half + 1 :]
-    path.write_bytes({"empty": b"", "truncated": whole[:half]}.get(damage, flipped))
+    for damaged in (b"", flipped):
+        path.write_bytes(damaged)
+        assert build.build(tmp_path) == path
+        assert path.read_bytes() == whole
+    path.write_bytes(whole[:half])
     # Loading it would kill the process.
     run_python(_LOAD, str(tmp_path))
-    assert build._is_whole(path)
+    assert path.read_bytes() == whole
     assert os.listdir(tmp_path) == [path.name]
 
 
