@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import types
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import pytest
 import jaxil
 from jaxil import export
 from jaxil.files.tables import read_csv
-from jaxil.training import expert_distance
+from jaxil.training import expert_distance, learning_curve, parts
 from tests.commands import ROOT, STATES, arguments, call, small_run
 
 _CLOCKS = ("seconds", "frames_per_second", "reward_seconds")
@@ -26,6 +27,14 @@ def _quick_distance():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(expert_distance, "_RANDOM_EPISODES", 1)
         yield
+
+
+@pytest.fixture
+def plain(monkeypatch):
+    """Leaves out what takes long and the unbroken run shows: distances and plots."""
+    distance = types.SimpleNamespace(relative_distance=lambda episodes: None)
+    monkeypatch.setattr(parts, "ExpertDistance", lambda *_: distance)
+    monkeypatch.setattr(learning_curve, "plot", lambda *_, **__: None)
 
 
 @pytest.fixture(name="unbroken", scope="module")
@@ -91,6 +100,7 @@ def test_pdac_trains_shows_itself_and_is_evaluated_again(unbroken):
     assert (unbroken / "train.csv").read_text() == before
 
 
+@pytest.mark.usefixtures("plain")
 def test_outlives_its_pipe_and_resumes_bit_for_bit_after_a_kill(unbroken, tmp_path):
     process = _start(*small_run("pdac", tmp_path), *_REFRESHED)
     # It outlives the pipe that it writes to, as in `... 2>&1 | head -1`.
@@ -115,6 +125,7 @@ def test_outlives_its_pipe_and_resumes_bit_for_bit_after_a_kill(unbroken, tmp_pa
     np.testing.assert_array_equal(got["task_return_mean"], expected["task_return_mean"])
 
 
+@pytest.mark.usefixtures("plain")
 @pytest.mark.parametrize("method", ["psil", "sil", "dac"])
 def test_method_trains(method, tmp_path):
     flags = (*small_run(method, tmp_path), "--config.total_frames=2000")
@@ -133,6 +144,7 @@ def test_method_trains(method, tmp_path):
         np.testing.assert_allclose(filmed["plan"].sum(axis=1), 1 / 101, rtol=1e-3)
 
 
+@pytest.mark.usefixtures("plain")
 def test_cloning_learns_without_playing(tmp_path):
     finished = call(
         "launch",
@@ -152,6 +164,7 @@ def test_cloning_learns_without_playing(tmp_path):
     )
 
 
+@pytest.mark.usefixtures("plain")
 def test_state_expert_is_recorded_and_imitated(tmp_path):
     expert = tmp_path / "expert"
     trained = call(

@@ -354,14 +354,6 @@ def test_a_file_cut_off_anywhere_is_refused(path):
             states.read_states(path)
 
 
-def test_a_flipped_byte_is_noticed(path):
-    content = bytearray(path.read_bytes())
-    content[200] ^= 0xFF  # within the compressed positions
-    path.write_bytes(bytes(content))
-    with pytest.raises(DemonstrationError, match="damaged"):
-        states.read_states(path)
-
-
 @pytest.mark.parametrize("folder", [True, False])
 def test_a_file_that_cannot_be_opened(tmp_path, folder):
     path = tmp_path if folder else tmp_path / "none.npz"
@@ -418,17 +410,6 @@ def test_the_writer_keeps_the_rules_and_the_old_file(path):
     assert [entry.name for entry in path.parent.iterdir()] == [path.name]
 
 
-def test_a_write_that_fails_leaves_the_old_file(path, monkeypatch):
-    def fail(*_, **__):
-        raise OSError("disk full")
-
-    monkeypatch.setattr(np.lib.format, "write_array", fail)
-    with pytest.raises(OSError, match="disk full"):
-        states.write_states(path, RECORDED)
-    assert_same(states.read_states(path), RECORDED)
-    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
-
-
 # --- shipped --------------------------------------------------------------------------
 
 
@@ -461,26 +442,10 @@ def test_the_shipped_experts_are_good_and_small():
     assert set(states.shipped_tasks()) == set(paths)
     assert sum(path.stat().st_size for path in paths.values()) < 25e6
     for task, path in paths.items():
+        loading.check("", task=task, num_episodes=10, action_repeat=2)
         rewards = states.read_states(path, task=task).rewards
         assert len(rewards) == 50
         assert rewards.sum(axis=1).mean() >= LEAST_MEAN_RETURNS[task], task
-
-
-@pytest.mark.parametrize("task", states.shipped_tasks())
-def test_every_shipped_file_can_be_shown(task):
-    stored = states.read_states(states.shipped_path(task), task=task)
-    assert len(stored.rewards) >= 10
-    one = {name: getattr(stored, name)[:1, :2] for name in ("qpos", "qvel", "act")}
-    frames = rendering.observe_episodes(
-        one,
-        task=task,
-        seed=stored.metadata["seed"],
-        first_episode=stored.metadata["first_episode"],
-        cache=False,
-        **VIEW,
-    )
-    assert frames.std() > 1.0
-    loading.check("", task=task, num_episodes=10, action_repeat=2)
 
 
 @pytest.mark.parametrize("task", states.shipped_tasks())
@@ -523,3 +488,4 @@ def test_shipped_actions_played_again_lead_to_the_stored_states(task):
         **VIEW,
     )
     assert (drawn[0] != np.stack(frames)).mean() < 1e-3
+    assert drawn.std() > 1.0

@@ -57,7 +57,6 @@ PSIL = psil.make_rewarder(
     target_update_steps=10,
     return_scale=10.0,
 )
-QUIET = optax.constant_schedule(0.0)
 
 
 def make_learner(rewarder: Rewarder = DRQV2, **changes) -> Learner:
@@ -302,20 +301,6 @@ def test_the_rewrite_would_show_a_mistake(mistake):
 # Who moves what ----------------------------------------------------------------
 
 
-def test_the_critic_target_uses_target_critic_and_live_encoder():
-    learner = make_learner(shift_padding=0, exploration_std=QUIET)
-    state, batch = make_state(learner), make_batch(0)
-    _, metrics = jitted(learner)(state, batch, None)
-    encoder, actor, critic = NETWORKS
-    z = apply(encoder, state.encoder.params, batch.next_observation)
-    action = jnp.tanh(apply(actor, state.actor.params, z))
-    values = apply(critic, state.target_critic, z, action)
-    target = batch.reward + batch.discount * jnp.min(values, axis=0)
-    np.testing.assert_allclose(metrics["critic/target"], target.mean(), rtol=1e-5)
-    live = apply(critic, state.critic.params, z, action)
-    assert np.abs(live - values).max() > 1e-2
-
-
 def test_only_the_critic_loss_moves_encoder_and_critic():
     # Values of zero at reward zero: the critic loss and its gradient vanish, while
     # actor and discriminator go on learning.
@@ -394,18 +379,6 @@ def test_a_rewarder_with_nothing_to_learn_is_left_alone():
     state = make_state(learner)
     after, _ = jitted(learner)(state, make_batch(0), None)
     assert_identical(after.rewarder, state.rewarder)
-
-
-def test_the_target_critic_follows_by_tau():
-    learner = make_learner()
-    state = make_state(learner)
-    after, _ = jitted(learner)(state, make_batch(0), None)
-    expected = jax.tree.map(
-        lambda new, old: old + TAU * (new - old),
-        after.critic.params,
-        state.target_critic,
-    )
-    chex.assert_trees_all_close(after.target_critic, expected, atol=1e-6)
 
 
 def test_the_pre_tanh_penalty_is_a_mean_square():
