@@ -11,7 +11,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Tracing takes most of the time: a fifth of it goes into notes of where each operation
 # was written, and into searching for garbage among what is still used.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
-gc.set_threshold(200_000, 50, 100)
+gc.set_threshold(50_000, 20, 20)
 startup.prepare()
 
 # A shell that starts the tests in the background has them ignore Ctrl-C, nohup has them

@@ -12,10 +12,10 @@ from tests import own_loop
 from tests.commands import ROOT, arguments
 
 
-def _python(script: str, **variables: str | None):
+def _run(*words: str, **variables: str | None):
     changed = {**os.environ, "JAX_PLATFORMS": "cpu", **variables}
     return subprocess.run(
-        [sys.executable, "-c", script],
+        words,
         check=False,
         cwd=ROOT,
         env={name: value for name, value in changed.items() if value is not None},
@@ -23,6 +23,10 @@ def _python(script: str, **variables: str | None):
         text=True,
         timeout=240,
     )
+
+
+def _python(script: str, **variables: str | None):
+    return _run(sys.executable, "-c", script, **variables)
 
 
 def test_an_agent_learns_in_a_loop_of_ones_own():
@@ -86,15 +90,7 @@ def test_tasks_without_a_time_limit_end(most_frames, steps):
 def test_what_the_machine_lacks_is_one_message(variables, expected, tmp_path):
     folder = tmp_path / "run"
     flags = ("--config=zero:cartpole_swingup", f"--workdir={folder}")
-    finished = subprocess.run(
-        arguments("launch", *flags),
-        check=False,
-        cwd=ROOT,
-        env={**os.environ, "JAX_PLATFORMS": "cpu", **variables},
-        capture_output=True,
-        text=True,
-        timeout=240,
-    )
+    finished = _run(*arguments("launch", *flags), **variables)
     assert finished.returncode == 2
     assert expected in finished.stderr
     assert "Traceback" not in finished.stderr
