@@ -2,8 +2,6 @@
 
 import json
 import logging
-import os
-import pathlib
 import zipfile
 from typing import Any
 
@@ -371,17 +369,6 @@ def test_arrays_that_would_fill_the_memory_are_not_unpacked(path, monkeypatch):
     tampered(path, lambda arrays: set_metadata(arrays, expert="", versions={}))
     with pytest.raises(DemonstrationError, match=r"in all .* more than the 1000"):
         states.read_states(path)
-
-
-@pytest.mark.parametrize("use", [load, loading.check])
-def test_a_pipe_or_a_device_is_refused_at_once(use, tmp_path):
-    pipe = tmp_path / "pipe.npz"
-    os.mkfifo(pipe)
-    for path in (pipe, pathlib.Path("/dev/zero")):
-        with pytest.raises(DemonstrationError, match="not a regular file"):
-            use(path, **{"task": TASK, "num_episodes": 1, "action_repeat": 2})
-        with pytest.raises(DemonstrationError, match="not a regular file"):
-            states.read_states(path)
 
 
 def test_a_header_that_promises_more_than_there_is(path):

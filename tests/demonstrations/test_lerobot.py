@@ -212,11 +212,6 @@ ROW_FAULTS = {
         set_row(1, action=[1.0, None]),
         "not numbers in",
     ),
-    "two rewards": (
-        DATA_FILE,
-        lambda rows: [{**row, "next.reward": [1.0, 2.0]} for row in rows],
-        "has rewards of type float64 and shape .2, 2. in",
-    ),
 }
 
 

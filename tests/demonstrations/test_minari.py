@@ -254,18 +254,6 @@ FAULTS = {
         replace("episode_1/rewards", data=np.zeros(4)),
         r"rewards of type float64 and shape \(4,\) in episode 1, but numbers of 5",
     ),
-    "an action too many": (
-        replace("episode_1/actions", data=np.zeros((6, 2), np.float32)),
-        "in episode 1, but numbers of 5",
-    ),
-    "no step": (
-        replace("episode_1/rewards", data=np.zeros(0)),
-        "in episode 1, but numbers of 5",
-    ),
-    "words": (
-        replace("episode_0/rewards", data=[b"a", b"b", b"c"]),
-        "has rewards of type",
-    ),
     "no observations": (
         lambda f: f["episode_0"].pop("observations"),
         "observations in",
@@ -275,10 +263,6 @@ FAULTS = {
     "grey": (
         replace(IMAGES, data=np.zeros((4, 8, 8, 1), np.uint8)),
         r"has 0 images, uint8 \[H, W, 3\]",
-    ),
-    "numbers as images later": (
-        replace("episode_1/observations", data=np.zeros((6, 3))),
-        "has frames of type float64",
     ),
     "values in another file": (
         replace(

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxil.machine import cache
 from jaxil.maths import convolution
 from jaxil.native import build, encoding
 from jaxil.native.encoding import Weights
@@ -330,9 +331,10 @@ print("equal")
 
 
 @pytest.mark.parametrize("kind", ["x86-64-v3", "x86-64-v4"])
-def test_vectors_of_either_length_compute_the_same(kind, tmp_path):
+def test_vectors_of_either_length_compute_the_same(kind):
     flags = pathlib.Path("/proc/cpuinfo").read_text()
     if {"x86-64-v3": " avx2 ", "x86-64-v4": " avx512vl "}[kind] not in flags:
         pytest.skip(f"this processor is no {kind}")
     text = DRAWN + OTHER_PROCESSOR
-    assert run_python(text, "8", str(tmp_path), f"-march={kind}") == "equal\n"
+    folder = str(cache.compilation_folder())  # compiled once, also for later tests
+    assert run_python(text, "8", folder, f"-march={kind}") == "equal\n"
