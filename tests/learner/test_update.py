@@ -74,15 +74,17 @@ def make_learner(rewarder: Rewarder = DRQV2, **changes) -> Learner:
 
 
 @functools.cache
-def init(learner: Learner):
-    """Returns a function of a key, compiled: one program instead of hundreds."""
+def compiled_init(networks, rewarder_init):
+    """One program for all learners that start alike, instead of hundreds of small."""
+    learner = make_learner(DRQV2._replace(init=rewarder_init), networks=networks)
     observation = np.zeros((SIDE, SIDE, CHANNELS), np.uint8)
     return jax.jit(lambda key: init_train_state(learner, key, observation, SPEC))
 
 
 def make_state(learner: Learner, seed: int = 0):
     """A state whose target critic is not its critic, or mixing them goes unseen."""
-    state, other = (init(learner)(jax.random.key(n)) for n in (seed, seed + 100))
+    init = compiled_init(learner.networks, learner.rewarder.init)
+    state, other = (init(jax.random.key(n)) for n in (seed, seed + 100))
     return state.replace(target_critic=other.target_critic)
 
 
