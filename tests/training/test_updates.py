@@ -84,8 +84,8 @@ def make_config(method, **changes):
         checkpoint_every_frames=2 * STEPS,
         video_every_evals=0,
     )
-    config.encoder.channels = (4,)
-    config.encoder.kernel_sizes, config.encoder.strides = (4,), (4,)
+    config.encoder.channels = (4, 4)
+    config.encoder.kernel_sizes, config.encoder.strides = (3, 3), (2, 1)
     sizes = {"batch_size": 4, "hidden_dim": 16}
     for section in {"discriminator", "cloning"} & set(config):
         config[section].update({n: sizes[n] for n in sizes if n in config[section]})
