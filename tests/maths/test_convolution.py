@@ -58,11 +58,11 @@ class ConvolveReluTest(chex.TestCase):
         (3, 1), (3, 2), (3, 4), (4, 4), (2, 2), (8, 4), (1, 1), (1, 2)
     )
     def test_equals_xla(self, size, stride):
-        arguments = draw(0, (2, 13, 13, 3), (size, size, 3, 5))
-        ours = jax.jit(functools.partial(convolution.convolve_relu, stride=stride))
-        np.testing.assert_allclose(
-            ours(*arguments), reference(*arguments, stride), rtol=1e-5, atol=1e-4
-        )
+        images, kernel, bias = draw(0, (2, 13, 13, 3), (size, size, 3, 5))
+        run = jax.jit(functools.partial(convolution.convolve_relu, stride=stride))
+        expected = reference(images, kernel, bias, stride)
+        ours = run(images, kernel, bias)
+        np.testing.assert_allclose(ours, expected, rtol=1e-5, atol=1e-4)
 
     def test_tile_gradient_by_hand(self):
         # Windows of 2 see every pixel but a last, odd one.
