@@ -30,7 +30,7 @@ if (($# == 0)); then # .pre-commit-config.yaml has the same three
   check ruff check .
   check ruff format --check .
   check pyright
-  set -- -n 2 --dist worksteal
+  set -- -n 3 --dist worksteal # on two cores: some tests mostly wait
 fi
 check python -m pytest "$@"
 exit "$status"

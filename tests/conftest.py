@@ -1,5 +1,6 @@
 """Strictness for all tests: no silent broadcasting, and one way of drawing."""
 
+import gc
 import os
 import signal
 
@@ -7,6 +8,10 @@ import signal
 from jaxil.machine import startup
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# Tracing takes most of the time: a fifth of it goes into notes of where each operation
+# was written, and into searching for garbage among what is still used.
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
+gc.set_threshold(50_000, 20, 20)
 startup.prepare()
 
 # A shell that starts the tests in the background has them ignore Ctrl-C, nohup has them
@@ -17,6 +22,15 @@ if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 import jax  # noqa: E402
+
+# Files whose tests mostly wait for other processes: begun first, they cost least.
+_WAITING = ("test_slurm.py", "test_sweep.py", "test_benchmark.py")
+
+
+def pytest_collection_modifyitems(items):
+    """Puts the longest tests first, so that no process is left alone with them."""
+    items.sort(key=lambda item: item.path.name not in _WAITING)
+
 
 # [B] against [B, 1] is the classic silent error of reinforcement learning.
 jax.config.update("jax_numpy_rank_promotion", "raise")

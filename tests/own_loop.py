@@ -23,6 +23,7 @@ def main() -> dict[str, float]:
     startup.prepare()  # settings of jax and OpenGL, before either is used
     config = presets.get_config("tiny", "pdac,cartpole_swingup")
     config.update(action_repeat=20, image_size=24, hidden_dim=16, batch_size=8)
+    config.encoder.update(channels=(32, 32), kernel_sizes=(4, 3), strides=(4, 1))
     config.discriminator.update(hidden_dim=16, batch_size=8)
     config.demonstrations.num_episodes = 1
     environment = assembly.training_environment(config)

@@ -1,7 +1,4 @@
-"""The benchmark: every part of a run has its time, and wrong use is refused at once.
-
-Two tests compile a small learner; they take a minute on a busy core.
-"""
+"""The benchmark: every part of a run has its time, and wrong use is refused at once."""
 
 import contextlib
 import json
@@ -14,7 +11,7 @@ from jaxil import config as jaxil_config
 from jaxil.errors import UsageError
 from jaxil.timing import measurement, start, tables
 from jaxil.timing.bench import Bench
-from tests.commands import run, small
+from tests.commands import call, small
 
 _CONFIG = "--config=configs/tiny.py:pdac,ball_in_cup_catch"
 # What others read: these names stay.
@@ -30,17 +27,19 @@ def measured(tmp_path_factory):
     folder = tmp_path_factory.mktemp("benchmark")
     old = {"update_ms": 1e-3, "device": "abacus", "config": {}}
     (folder / "old.json").write_text(json.dumps(old))
-    finished = run(
-        "benchmark",
-        _CONFIG,
-        *small("pdac"),
-        "--config.replay_on_device=False",  # so that batches are pixels
-        "--repeats=2",
-        "--steps=20",
-        f"--json={folder / 'new.json'}",
-        f"--compare={folder / 'old.json'}",
-        timeout=600.0,
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        # Compiling without a cache takes half a minute, and has a test of its own.
+        patch.setattr(start, "compile_seconds", lambda lower: 1.0)
+        finished = call(
+            "benchmark",
+            _CONFIG,
+            *small("pdac"),
+            "--config.replay_on_device=False",  # so that batches are pixels
+            "--repeats=2",
+            "--steps=20",
+            f"--json={folder / 'new.json'}",
+            f"--compare={folder / 'old.json'}",
+        )
     assert finished.returncode == 0, finished.stderr
     return finished, json.loads((folder / "new.json").read_text())
 
@@ -176,7 +175,7 @@ def test_wrong_use_is_told_before_anything_is_measured(flags, expected, monkeypa
 
 
 def test_wrong_use_ends_with_status_2():
-    finished = run("benchmark", _CONFIG, "--compare=configs/tiny.py")
+    finished = call("benchmark", _CONFIG, "--compare=configs/tiny.py")
     assert finished.returncode == 2
     assert "is not a file that" in finished.stderr
     assert "Traceback" not in finished.stderr
@@ -191,8 +190,10 @@ def test_a_start_that_fails_is_reported(monkeypatch):
     assert "broken" in messages[0]
 
 
-def test_compiling_cold_uses_no_cache():
-    enabled = []
+def test_compiling_cold_uses_no_cache(monkeypatch):
+    cleared, enabled = [], []
+    # Other tests would compile their programs again.
+    monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(True))
 
     class Program:
         def compile(self):
@@ -200,6 +201,7 @@ def test_compiling_cold_uses_no_cache():
 
     assert start.compile_seconds(Program) > 0
     assert enabled == [False]
+    assert cleared
     assert _cache_is_enabled()
 
 

@@ -12,10 +12,10 @@ from tests import own_loop
 from tests.commands import ROOT, arguments
 
 
-def _python(script: str, **variables: str | None):
+def _run(*words: str, **variables: str | None):
     changed = {**os.environ, "JAX_PLATFORMS": "cpu", **variables}
     return subprocess.run(
-        [sys.executable, "-c", script],
+        words,
         check=False,
         cwd=ROOT,
         env={name: value for name, value in changed.items() if value is not None},
@@ -23,6 +23,10 @@ def _python(script: str, **variables: str | None):
         text=True,
         timeout=240,
     )
+
+
+def _python(script: str, **variables: str | None):
+    return _run(sys.executable, "-c", script, **variables)
 
 
 def test_an_agent_learns_in_a_loop_of_ones_own():
@@ -38,22 +42,23 @@ def test_the_package_is_imported_without_jax():
     assert "has no attribute 'nothing'" in _python(script).stderr
 
 
-_STATES = """
+_OBSERVE = """
 from jaxil.environments import suite
-environment = suite.make_environment("cartpole_swingup", seed=0, observation={!r})
-print(environment.reset().observation.shape)
+for observation in {!r}:
+    made = suite.make_environment("cartpole_swingup", seed=0, observation=observation)
+    print(made.reset().observation.shape)
 """
 
 
 def test_environments_need_no_call_before_their_import():
-    made = _python(_STATES.format("pixels"), MUJOCO_GL=None, PYOPENGL_PLATFORM=None)
+    made = _python(_OBSERVE.format(["pixels"]), MUJOCO_GL=None, PYOPENGL_PLATFORM=None)
     assert made.stdout == "(84, 84, 9)\n", made.stderr
 
 
 def test_states_need_no_opengl():
     no_display = {"MUJOCO_GL": "glfw", "DISPLAY": None, "WAYLAND_DISPLAY": None}
-    assert _python(_STATES.format("state"), **no_display).stdout == "(5,)\n"
-    failed = _python(_STATES.format("pixels"), **no_display)
+    failed = _python(_OBSERVE.format(["state", "pixels"]), **no_display)
+    assert failed.stdout == "(5,)\n"
     assert "MUJOCO_GL=glfw does not work here (there is no display)" in failed.stderr
 
 
@@ -85,15 +90,7 @@ def test_tasks_without_a_time_limit_end(most_frames, steps):
 def test_what_the_machine_lacks_is_one_message(variables, expected, tmp_path):
     folder = tmp_path / "run"
     flags = ("--config=zero:cartpole_swingup", f"--workdir={folder}")
-    finished = subprocess.run(
-        arguments("launch", *flags),
-        check=False,
-        cwd=ROOT,
-        env={**os.environ, "JAX_PLATFORMS": "cpu", **variables},
-        capture_output=True,
-        text=True,
-        timeout=240,
-    )
+    finished = _run(*arguments("launch", *flags), **variables)
     assert finished.returncode == 2
     assert expected in finished.stderr
     assert "Traceback" not in finished.stderr

@@ -11,7 +11,7 @@ import pytest
 from jaxil import config as jaxil_config
 from jaxil import methods
 from jaxil.errors import UsageError
-from tests.commands import ROOT, run, small_run
+from tests.commands import ROOT, call, small_run
 from tests.processes import run_python
 from tests.reporting.run_folders import write_run
 
@@ -120,16 +120,15 @@ def package(tmp_path, monkeypatch) -> pathlib.Path:
     folder = tmp_path / "site"
     folder.mkdir()
     (folder / "my_method.py").write_text(_BRIGHT)
-    monkeypatch.setenv(
-        "PYTHONPATH", os.pathsep.join(filter(None, (str(folder), str(ROOT))))
-    )
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(folder), str(ROOT))))
     return folder
 
 
 def test_a_method_from_outside_trains(package, tmp_path):
     del package
     workdir = tmp_path / "run"
-    finished = run(
+    finished = call(
         "launch",
         *small_run("zero", workdir),
         "--config.method=my_method:METHOD",
@@ -147,7 +146,7 @@ def test_a_method_from_outside_trains(package, tmp_path):
 
 def test_its_own_fields_are_checked_like_any_other(package, tmp_path):
     del package
-    finished = run(
+    finished = call(
         "launch",
         *small_run("zero", tmp_path / "run"),
         "--config.method=my_method:METHOD",
@@ -247,13 +246,13 @@ def test_reading_a_folder_imports_no_module_that_it_names(package, trap):
 
 def test_a_command_imports_a_module_that_the_user_names(package, trap, tmp_path):
     output = tmp_path / "report"
-    finished = run("evaluate", f"--workdir={trap}")
+    finished = call("evaluate", f"--workdir={trap}")
     assert finished.returncode == 2
     assert "is code from outside" in finished.stderr
     assert "Traceback" not in finished.stderr
     assert not _was_sprung(package)
     words = (str(trap), "--trust", "trap.inner:METHOD", f"--output={output}")
-    finished = run("report", *words)
+    finished = call("report", *words)
     assert finished.returncode == 0, finished.stderr
     assert "Bright" in (output / "index.html").read_text()
     assert _was_sprung(package)

@@ -11,8 +11,8 @@ from jaxil import collect, outside
 from jaxil.config import default_config
 from jaxil.demonstrations import foreign, states
 from jaxil.errors import UsageError
-from jaxil.training import workdir
-from tests.commands import ROOT, run, small
+from jaxil.training import expert_distance, workdir
+from tests.commands import ROOT, call, run, small
 
 # A package of one file, as a user would write it: a light that can be pushed around.
 _OWN = """
@@ -64,8 +64,8 @@ def centre(image):
     return np.clip([1.0 - columns.mean() * 2.0 / image.shape[1]], -1.0, 1.0)
 
 
-def balance(state):
-    return np.clip([0.5 * state[1] + 0.3 * state[3]], -1.0, 1.0)
+def lean(state):  # lets the pole fall: episodes of some thirty steps
+    return np.clip([0.05 * state[1]], -1.0, 1.0)
 """
 _SIZES = (
     "--config.action_repeat=2",
@@ -82,6 +82,7 @@ def _package(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     path = os.pathsep.join((str(tmp_path), str(ROOT)))
     monkeypatch.setenv("PYTHONPATH", path)
+    monkeypatch.setattr(expert_distance, "_RANDOM_EPISODES", 1)
 
 
 def rows(path):
@@ -92,7 +93,7 @@ def rows(path):
 @pytest.mark.parametrize(
     ("task", "policy"),
     [
-        ("gymnasium:InvertedPendulum-v5", "light:balance"),
+        ("gymnasium:InvertedPendulum-v5", "light:lean"),
         ("light:make", "light:centre"),
     ],
 )
@@ -126,9 +127,7 @@ def test_a_task_from_outside_is_recorded_trained_resumed_and_shown(
         f"--config.demonstrations.source={expert}",
     )
     for total in (60, 120):
-        finished = run(
-            "launch", *flags, f"--config.total_frames={total}", timeout=600.0
-        )
+        finished = call("launch", *flags, f"--config.total_frames={total}")
         assert finished.returncode == 0, finished.stderr
     assert "resuming from the checkpoint" in finished.stderr
     frames = [int(row["frame"]) for row in rows(workdir / "train.csv")]
@@ -137,17 +136,18 @@ def test_a_task_from_outside_is_recorded_trained_resumed_and_shown(
     assert list((workdir / "videos").glob("frame_*.mp4"))
     assert float(rows(workdir / "eval.csv")[-1]["expert_task_return_mean"]) > 0
 
-    evaluated = run("evaluate", f"--workdir={workdir}", "--num_episodes=1")
-    if task.startswith("gymnasium"):
-        assert evaluated.returncode == 0, evaluated.stderr
-    else:  # the folder alone may not make Python import anything
-        assert evaluated.returncode == 2
-        assert f"--trust={task}" in evaluated.stderr
-        trusted = (f"--workdir={workdir}", "--num_episodes=1", f"--trust={task}")
-        evaluated = run("evaluate", *trusted)
-        assert evaluated.returncode == 0, evaluated.stderr
+    evaluate = ("evaluate", f"--workdir={workdir}", "--num_episodes=1")
+    if not task.startswith("gymnasium"):
+        # In a process of its own, which the user has told nothing: the folder alone
+        # may not make Python import anything.
+        refused = run(*evaluate)
+        assert refused.returncode == 2
+        assert f"--trust={task}" in refused.stderr
+        evaluate += (f"--trust={task}",)
+    evaluated = call(*evaluate)
+    assert evaluated.returncode == 0, evaluated.stderr
     assert "the expert's mean" in evaluated.stdout
-    reported = run("report", str(workdir.parent), f"--output={tmp_path / 'report'}")
+    reported = call("report", str(workdir.parent), f"--output={tmp_path / 'report'}")
     assert reported.returncode == 0, reported.stderr
     assert task in (tmp_path / "report" / "index.html").read_text()
 

@@ -16,7 +16,8 @@ from jaxil.sweeps import clusters, plan, state, tables
 from jaxil.sweeps.clusters import Cluster
 from jaxil.sweeps.state import State, Status
 from jaxil.training import workdir
-from tests.commands import ROOT, SMALL, STATES
+from tests import commands
+from tests.commands import ROOT, SMALL, STATES, call
 from tests.processes import wait_for
 from tests.trainer import FRAMES, stand_in
 
@@ -220,7 +221,8 @@ def test_slurm_commands_without_a_cluster_are_no_slurm(tmp_path, monkeypatch):
 
 
 def test_wrong_use_of_the_command_ends_with_status_2(tmp_path):
-    done = _sweep(
+    done = call(
+        "sweep",
         *("--methods=gail", "--seeds=0", "--cluster=pbs", "--tasks=walker_wlak"),
         *("--config.bath_size", "8"),
     )
@@ -462,39 +464,28 @@ def test_a_run_that_has_heard_a_signal_is_not_ended_by_its_worker(tmp_path):
     assert (run.folder / "checkpoints" / f"frame_{done:012d}").exists()
 
 
-# A minute on a busy machine: two starts of the real command.
 def test_real_runs_from_the_plan_to_the_table(tmp_path):
     flags = [
         *("--methods=drqv2", "--preset=tiny", "--tasks=ball_in_cup_catch"),
         *("--seeds=1", "--workers=1", f"--workdir={tmp_path}", *SMALL),
         *(*STATES, "--config.total_frames=2000"),
     ]
-    planned = _sweep(*flags, "--dry_run")
+    planned = call("sweep", *flags, "--dry_run")
     assert planned.returncode == 0, planned.stderr
     assert "1 missing" in planned.stdout
     assert "jaxil.launch --config=tiny:drqv2,ball_in" in planned.stdout
     assert not list(tmp_path.iterdir())
-    done = _sweep(*flags)
+    done = commands.run("sweep", *flags)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "seed0: finished, return" in done.stdout
     home = tmp_path / "ball_in_cup_catch" / "drqv2" / "seed0"
     before = (home / "train.csv").stat().st_mtime_ns
-    watched = _sweep(*flags, "--watch")
+    watched = call("sweep", *flags, "--watch")
     assert "2,000/2,000" in watched.stdout
-    again = _sweep(*flags)
+    again = call("sweep", *flags)
     assert again.returncode == 0
     assert "1 finished" in again.stdout
     assert (home / "train.csv").stat().st_mtime_ns == before
-
-
-def _sweep(*flags: str):
-    return subprocess.run(
-        [sys.executable, "-m", "jaxil.sweep", *flags],
-        cwd=ROOT,
-        env={**os.environ, "JAX_PLATFORMS": "cpu"},
-        capture_output=True,
-        text=True,
-    )
 
 
 def _quick(folder, name):

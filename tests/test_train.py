@@ -256,12 +256,6 @@ def test_an_episode_lost_at_the_budgets_end_is_played_before_the_last_evaluation
     assert tape[-3:] == ["store [10, 11, 12, 13]", "last evaluation", "save"]
 
 
-def test_the_loss_of_all_environments_at_once_is_no_end():
-    changes: Any = {"num_environments": 2, "total_frames": 12}
-    dummies = Dummies(lost=[0, 1], **changes).loop()
-    assert dummies.tape == Dummies(**changes).loop().tape
-
-
 @pytest.mark.parametrize("size", [1, 2])
 def test_a_stop_is_heeded_after_the_step(size):
     dummies = Dummies(num_environments=size, total_frames=60)

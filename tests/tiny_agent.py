@@ -52,7 +52,12 @@ def make_spec(
 @functools.cache
 def make_params(seed: int, frame_stack: int = 1) -> LearnerParams:
     """Returns parameters of `NETWORKS`; they must not be changed in place."""
-    keys = jax.random.split(jax.random.key(seed), 3)
+    return _init_params(jax.random.key(seed), frame_stack)
+
+
+@functools.partial(jax.jit, static_argnums=1)  # one program instead of a hundred
+def _init_params(key: jax.Array, frame_stack: int) -> LearnerParams:
+    keys = jax.random.split(key, 3)
     images = jnp.zeros((1, SIDE, SIDE, 3 * frame_stack), jnp.uint8)
     encoder = NETWORKS.encoder.init(keys[0], images)
     z = apply(NETWORKS.encoder, encoder, images)

@@ -2,8 +2,6 @@
 
 import json
 import logging
-import os
-import pathlib
 import zipfile
 from typing import Any
 
@@ -354,14 +352,6 @@ def test_a_file_cut_off_anywhere_is_refused(path):
             states.read_states(path)
 
 
-def test_a_flipped_byte_is_noticed(path):
-    content = bytearray(path.read_bytes())
-    content[200] ^= 0xFF  # within the compressed positions
-    path.write_bytes(bytes(content))
-    with pytest.raises(DemonstrationError, match="damaged"):
-        states.read_states(path)
-
-
 @pytest.mark.parametrize("folder", [True, False])
 def test_a_file_that_cannot_be_opened(tmp_path, folder):
     path = tmp_path if folder else tmp_path / "none.npz"
@@ -379,17 +369,6 @@ def test_arrays_that_would_fill_the_memory_are_not_unpacked(path, monkeypatch):
     tampered(path, lambda arrays: set_metadata(arrays, expert="", versions={}))
     with pytest.raises(DemonstrationError, match=r"in all .* more than the 1000"):
         states.read_states(path)
-
-
-@pytest.mark.parametrize("use", [load, loading.check])
-def test_a_pipe_or_a_device_is_refused_at_once(use, tmp_path):
-    pipe = tmp_path / "pipe.npz"
-    os.mkfifo(pipe)
-    for path in (pipe, pathlib.Path("/dev/zero")):
-        with pytest.raises(DemonstrationError, match="not a regular file"):
-            use(path, **{"task": TASK, "num_episodes": 1, "action_repeat": 2})
-        with pytest.raises(DemonstrationError, match="not a regular file"):
-            states.read_states(path)
 
 
 def test_a_header_that_promises_more_than_there_is(path):
@@ -414,17 +393,6 @@ def test_the_writer_keeps_the_rules_and_the_old_file(path):
     broken = RECORDED._replace(rewards=np.full_like(RECORDED.rewards, np.inf))
     with pytest.raises(DemonstrationError, match="rewards"):
         states.write_states(path, broken)
-    assert_same(states.read_states(path), RECORDED)
-    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
-
-
-def test_a_write_that_fails_leaves_the_old_file(path, monkeypatch):
-    def fail(*_, **__):
-        raise OSError("disk full")
-
-    monkeypatch.setattr(np.lib.format, "write_array", fail)
-    with pytest.raises(OSError, match="disk full"):
-        states.write_states(path, RECORDED)
     assert_same(states.read_states(path), RECORDED)
     assert [entry.name for entry in path.parent.iterdir()] == [path.name]
 
@@ -461,26 +429,10 @@ def test_the_shipped_experts_are_good_and_small():
     assert set(states.shipped_tasks()) == set(paths)
     assert sum(path.stat().st_size for path in paths.values()) < 25e6
     for task, path in paths.items():
+        loading.check("", task=task, num_episodes=10, action_repeat=2)
         rewards = states.read_states(path, task=task).rewards
         assert len(rewards) == 50
         assert rewards.sum(axis=1).mean() >= LEAST_MEAN_RETURNS[task], task
-
-
-@pytest.mark.parametrize("task", states.shipped_tasks())
-def test_every_shipped_file_can_be_shown(task):
-    stored = states.read_states(states.shipped_path(task), task=task)
-    assert len(stored.rewards) >= 10
-    one = {name: getattr(stored, name)[:1, :2] for name in ("qpos", "qvel", "act")}
-    frames = rendering.observe_episodes(
-        one,
-        task=task,
-        seed=stored.metadata["seed"],
-        first_episode=stored.metadata["first_episode"],
-        cache=False,
-        **VIEW,
-    )
-    assert frames.std() > 1.0
-    loading.check("", task=task, num_episodes=10, action_repeat=2)
 
 
 @pytest.mark.parametrize("task", states.shipped_tasks())
@@ -523,3 +475,4 @@ def test_shipped_actions_played_again_lead_to_the_stored_states(task):
         **VIEW,
     )
     assert (drawn[0] != np.stack(frames)).mean() < 1e-3
+    assert drawn.std() > 1.0

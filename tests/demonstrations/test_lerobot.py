@@ -212,11 +212,6 @@ ROW_FAULTS = {
         set_row(1, action=[1.0, None]),
         "not numbers in",
     ),
-    "two rewards": (
-        DATA_FILE,
-        lambda rows: [{**row, "next.reward": [1.0, 2.0]} for row in rows],
-        "has rewards of type float64 and shape .2, 2. in",
-    ),
 }
 
 
@@ -395,14 +390,6 @@ def test_more_than_the_limit_is_refused_and_the_limit_itself_is_not(
     limit = 5 * 8 * 8 * 3 - 1
     with pytest.raises(FormatError, match=f"bytes.*, more than the {limit} "):
         read(path, max_bytes=limit)
-
-
-def test_episodes_and_faults_pass_from_one_process_to_the_other(path):
-    recording = foreign.open_recording(path, max_bytes=2**24)
-    assert_same(list(recording.episodes), EPISODES)
-    change_rows(path, DATA_FILE, set_row(4, action=None))
-    with pytest.raises(FormatError, match="action"):
-        list(foreign.open_recording(path, max_bytes=2**24).episodes)
 
 
 def test_frames_of_videos_are_scaled_while_they_are_decoded(path):

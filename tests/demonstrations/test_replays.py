@@ -191,18 +191,6 @@ WRONG = {
     ),
     "no steps": ({k: v[:1] for k, v in ENTRIES.items()}, "too short"),
     "a number": ({"reward": np.float32(0)}, "different lengths"),
-    "actions without axis": (
-        {"action": ENTRIES["action"][:, 0]},
-        r"actions of type float32 and shape \(5,\) in episode 0, but",
-    ),
-    "rewards with axes": (
-        {"reward": np.zeros((6, 2))},
-        r"rewards of type float64 and shape \(5, 2\) in episode 0, but",
-    ),
-    "complex actions": (
-        {"action": ENTRIES["action"].astype(complex)},
-        "actions of type complex128",
-    ),
     "grey pictures": (
         {"image": np.zeros((6, 8, 8, 1), np.uint8)},
         r"shape \(6, 8, 8, 1\), not ",

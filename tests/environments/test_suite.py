@@ -125,11 +125,6 @@ def test_a_time_limit_keeps_the_discount_at_one(action_repeat, num_steps):
     assert count == num_steps
 
 
-def test_a_task_without_a_time_limit_is_cut_off_after_1000_frames():
-    environment = small("lqr_lqr_2_1", observation="state", action_repeat=4)
-    assert environment.episode_steps == 250
-
-
 # --- actions --------------------------------------------------------------------------
 
 

@@ -57,7 +57,6 @@ PSIL = psil.make_rewarder(
     target_update_steps=10,
     return_scale=10.0,
 )
-QUIET = optax.constant_schedule(0.0)
 
 
 def make_learner(rewarder: Rewarder = DRQV2, **changes) -> Learner:
@@ -74,11 +73,18 @@ def make_learner(rewarder: Rewarder = DRQV2, **changes) -> Learner:
     return dataclasses.replace(learner, **changes)
 
 
+@functools.cache
+def compiled_init(networks, rewarder_init):
+    """One program for all learners that start alike, instead of hundreds of small."""
+    learner = make_learner(DRQV2._replace(init=rewarder_init), networks=networks)
+    observation = np.zeros((SIDE, SIDE, CHANNELS), np.uint8)
+    return jax.jit(lambda key: init_train_state(learner, key, observation, SPEC))
+
+
 def make_state(learner: Learner, seed: int = 0):
     """A state whose target critic is not its critic, or mixing them goes unseen."""
-    observation = np.zeros((SIDE, SIDE, CHANNELS), np.uint8)
-    state = init_train_state(learner, jax.random.key(seed), observation, SPEC)
-    other = init_train_state(learner, jax.random.key(seed + 100), observation, SPEC)
+    init = compiled_init(learner.networks, learner.rewarder.init)
+    state, other = (init(jax.random.key(n)) for n in (seed, seed + 100))
     return state.replace(target_critic=other.target_critic)
 
 
@@ -302,20 +308,6 @@ def test_the_rewrite_would_show_a_mistake(mistake):
 # Who moves what ----------------------------------------------------------------
 
 
-def test_the_critic_target_uses_target_critic_and_live_encoder():
-    learner = make_learner(shift_padding=0, exploration_std=QUIET)
-    state, batch = make_state(learner), make_batch(0)
-    _, metrics = jitted(learner)(state, batch, None)
-    encoder, actor, critic = NETWORKS
-    z = apply(encoder, state.encoder.params, batch.next_observation)
-    action = jnp.tanh(apply(actor, state.actor.params, z))
-    values = apply(critic, state.target_critic, z, action)
-    target = batch.reward + batch.discount * jnp.min(values, axis=0)
-    np.testing.assert_allclose(metrics["critic/target"], target.mean(), rtol=1e-5)
-    live = apply(critic, state.critic.params, z, action)
-    assert np.abs(live - values).max() > 1e-2
-
-
 def test_only_the_critic_loss_moves_encoder_and_critic():
     # Values of zero at reward zero: the critic loss and its gradient vanish, while
     # actor and discriminator go on learning.
@@ -394,18 +386,6 @@ def test_a_rewarder_with_nothing_to_learn_is_left_alone():
     state = make_state(learner)
     after, _ = jitted(learner)(state, make_batch(0), None)
     assert_identical(after.rewarder, state.rewarder)
-
-
-def test_the_target_critic_follows_by_tau():
-    learner = make_learner()
-    state = make_state(learner)
-    after, _ = jitted(learner)(state, make_batch(0), None)
-    expected = jax.tree.map(
-        lambda new, old: old + TAU * (new - old),
-        after.critic.params,
-        state.target_critic,
-    )
-    chex.assert_trees_all_close(after.target_critic, expected, atol=1e-6)
 
 
 def test_the_pre_tanh_penalty_is_a_mean_square():
@@ -496,8 +476,8 @@ def test_successors_come_augmented_with_their_features_and_change_nothing_else()
 # A method's own term in the actor's loss ---------------------------------------
 
 
-def with_actor_loss(actor_loss) -> Learner:
-    return make_learner(DRQV2._replace(actor_loss=actor_loss))
+def with_actor_loss(actor_loss, **changes) -> Learner:
+    return make_learner(DRQV2._replace(actor_loss=actor_loss), **changes)
 
 
 def test_a_term_in_the_actors_loss_pulls_the_policy_and_nothing_else():
@@ -511,9 +491,9 @@ def test_a_term_in_the_actors_loss_pulls_the_policy_and_nothing_else():
         error = mean_action(learner, expert.observation) - target[None]
         return 100.0 * jnp.mean(error**2)
 
-    learner, expert = with_actor_loss(pull), make_expert(0)
+    learner, expert = with_actor_loss(pull, learning_rate=1e-2), make_expert(0)
     state = start = make_state(learner)
-    for _ in range(400):
+    for _ in range(150):
         state, metrics = jitted(learner)(state, make_batch(0), expert)
         assert np.isfinite(metrics["actor/loss"])
     before, after = (
@@ -524,7 +504,7 @@ def test_a_term_in_the_actors_loss_pulls_the_policy_and_nothing_else():
     # One update with and without it: only the actor differs.
     pulled, plain = (
         jitted(each)(start, make_batch(0), expert)[0]
-        for each in (learner, with_actor_loss(None))
+        for each in (learner, with_actor_loss(None, learning_rate=1e-2))
     )
     assert any_difference(pulled.actor, plain.actor)
     assert_identical(pulled.replace(actor=()), plain.replace(actor=()))

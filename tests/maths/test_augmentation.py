@@ -1,7 +1,6 @@
 """Shifts against their plain definition, and against DrQ-v2's own."""
 
 import functools
-from typing import Any
 
 import chex
 import jax
@@ -11,8 +10,6 @@ import pytest
 from absl.testing import parameterized
 
 from jaxil.maths import augmentation
-
-with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
 
 
 def probe_images(batch, height, width, channels):
@@ -78,14 +75,13 @@ def bilinear_shift(images, corners, padding):
 
 
 class RandomShiftTest(chex.TestCase):
-    @with_and_without_jit
     @parameterized.parameters(1, 4)
     def test_is_an_edge_padded_crop_with_all_channels_together(self, padding):
         key = jax.random.key(padding)
         rng = np.random.default_rng(padding)
         images = rng.integers(0, 256, (16, 8, 8, 9), dtype=np.uint8)
         shift = functools.partial(augmentation.random_shift, padding=padding)
-        shifted = np.asarray(self.variant(shift)(images, key))
+        shifted = np.asarray(jax.jit(shift)(images, key))
         corners = corners_of(key, 16, padding)
         for image, corner, result in zip(images, corners, shifted):
             np.testing.assert_array_equal(result, crop(image, corner, padding))
@@ -105,13 +101,6 @@ class RandomShiftTest(chex.TestCase):
         # 99.9 % point of chi-squared.
         assert np.sum((counts - 100.0) ** 2 / 100.0) < 51.2
 
-    @parameterized.parameters(np.uint8, np.float32)
-    def test_keeps_shape_and_dtype(self, dtype):
-        images = jnp.zeros((2, 5, 7, 3), dtype)
-        shifted = augmentation.random_shift(images, jax.random.key(0), padding=2)
-        assert shifted.shape == images.shape
-        assert shifted.dtype == dtype
-
     def test_height_and_width_are_not_swapped(self):
         images = probe_images(32, 5, 9, 2)
         key = jax.random.key(7)
@@ -128,15 +117,6 @@ class RandomShiftTest(chex.TestCase):
         images = probe_images(3, 4, 4, 2)
         shifted = augmentation.random_shift(images, jax.random.key(0), padding=0)
         np.testing.assert_array_equal(shifted, images)
-
-    def test_a_key_says_all(self):
-        images = probe_images(8, 8, 8, 1)
-        first, again, other = (
-            np.asarray(augmentation.random_shift(images, key, padding=4))
-            for key in (jax.random.key(0), jax.random.key(0), jax.random.key(1))
-        )
-        np.testing.assert_array_equal(first, again)
-        assert not np.array_equal(first, other)
 
     def test_rejects_a_single_image(self):
         with pytest.raises(AssertionError):

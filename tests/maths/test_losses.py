@@ -1,26 +1,18 @@
 """Losses at numbers worked by hand, their gradients, and their extremes."""
 
-from typing import Any
-
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from absl.testing import parameterized
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from jaxil.maths import losses
 
-with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
-
 
 class TdTargetTest(chex.TestCase):
-    @with_and_without_jit
     def test_by_hand(self):
-        target = self.variant(losses.td_target)(
+        target = jax.jit(losses.td_target)(
             jnp.array([1.0, -1.0, 0.5]),
             jnp.array([0.5, 0.0, 1.0]),
             jnp.array([[2.0, 3.0, -4.0], [4.0, 1.0, -3.0]]),
@@ -44,11 +36,10 @@ class TdTargetTest(chex.TestCase):
 
 
 class CriticLossTest(chex.TestCase):
-    @with_and_without_jit
     def test_by_hand(self):
         values = jnp.array([[1.0, 2.0], [3.0, 5.0]])
         # mean(1, 0) + mean(9, 9)
-        loss = self.variant(losses.critic_loss)(values, jnp.array([0.0, 2.0]))
+        loss = jax.jit(losses.critic_loss)(values, jnp.array([0.0, 2.0]))
         np.testing.assert_allclose(loss, 9.5)
 
     def test_gradient_is_twice_the_error_over_the_batch(self):
@@ -62,10 +53,9 @@ class CriticLossTest(chex.TestCase):
 
 
 class ActorLossTest(chex.TestCase):
-    @with_and_without_jit
     def test_by_hand(self):
         values = jnp.array([[1.0, 5.0], [2.0, 3.0]])
-        np.testing.assert_allclose(self.variant(losses.actor_loss)(values), -2.0)
+        np.testing.assert_allclose(jax.jit(losses.actor_loss)(values), -2.0)
 
     def test_raises_the_smaller_value_only(self):
         gradient = jax.grad(losses.actor_loss)(jnp.array([[1.0, 5.0], [2.0, 3.0]]))
@@ -77,7 +67,6 @@ class ActorLossTest(chex.TestCase):
 
 
 class DiscriminatorLossTest(chex.TestCase):
-    @with_and_without_jit
     @parameterized.parameters(
         # D = 1/2 for all: -log(1/2) twice.
         ([0.0, 0.0], [0.0, 0.0], 2.0 * np.log(2.0)),
@@ -93,9 +82,7 @@ class DiscriminatorLossTest(chex.TestCase):
         ),
     )
     def test_by_hand(self, expert, agent, expected):
-        loss = self.variant(losses.discriminator_loss)(
-            jnp.array(expert), jnp.array(agent)
-        )
+        loss = jax.jit(losses.discriminator_loss)(jnp.array(expert), jnp.array(agent))
         np.testing.assert_allclose(loss, expected, rtol=1e-6)
 
     @parameterized.parameters(1e4, -1e4)
@@ -113,27 +100,13 @@ class DiscriminatorLossTest(chex.TestCase):
             losses.discriminator_loss(jnp.ones(3), jnp.ones(4))
 
 
-@settings(derandomize=True, max_examples=30, deadline=None)
-@given(st.lists(st.floats(-50, 50, width=32), min_size=6, max_size=6))
-def test_discriminator_loss_is_binary_cross_entropy(logits):
-    expert, agent = jnp.array(logits[:3]), jnp.array(logits[3:])
-    # One mean over both halves has half the weight of two means.
-    both = optax.sigmoid_binary_cross_entropy(
-        jnp.concatenate([expert, agent]), jnp.array([1.0] * 3 + [0.0] * 3)
-    )
-    np.testing.assert_allclose(
-        losses.discriminator_loss(expert, agent), 2.0 * jnp.mean(both), rtol=1e-5
-    )
-
-
 class GradientPenaltyTest(chex.TestCase):
-    @with_and_without_jit
     @parameterized.parameters(((3.0, 4.0), 16.0), ((0.6, 0.8), 0.0), ((0.0, 0.5), 0.25))
     def test_of_a_linear_discriminator(self, weights, expected):
         # The gradient is w everywhere: (|w| - 1)^2.
         w = jnp.array(weights)
         expert, agent = jax.random.normal(jax.random.key(0), (2, 7, 2))
-        penalty = self.variant(
+        penalty = jax.jit(
             lambda e, a, k: losses.gradient_penalty(lambda x: x @ w, e, a, k)
         )(expert, agent, jax.random.key(1))
         np.testing.assert_allclose(penalty, expected, atol=1e-5)

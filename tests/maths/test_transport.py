@@ -1,7 +1,6 @@
 """Entropic transport: closed forms, marginals, and plain solvers in float64."""
 
 import functools
-from typing import Any
 
 import chex
 import jax
@@ -15,8 +14,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from jaxil.maths import transport
-
-with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
 
 
 def plan_of(cost, *, epsilon=0.1, num_iterations=200):
@@ -48,11 +45,10 @@ def plain_sinkhorn(cost, epsilon, num_iterations):
 
 
 class CosineCostTest(chex.TestCase):
-    @with_and_without_jit
     def test_at_0_90_and_180_degrees(self):
         x = jnp.array([[2.0, 0.0], [0.0, 0.5]])
         y = jnp.array([[3.0, 0.0], [0.0, 1.0], [-7.0, 0.0]])
-        cost = self.variant(transport.cosine_cost)(x, y)
+        cost = jax.jit(transport.cosine_cost)(x, y)
         expected = [[0.0, 1.0, 2.0], [1.0, 0.0, 1.0]]
         np.testing.assert_allclose(cost, expected, atol=1e-6)
 
@@ -112,32 +108,11 @@ class SinkhornPlanTest(chex.TestCase):
         np.testing.assert_allclose(plan.sum(1), 1.0 / num_agent, atol=1e-6)
         np.testing.assert_allclose(plan.sum(0), 1.0 / num_expert, atol=1e-4)
 
-    def test_rows_are_exact_before_columns_have_converged(self):
-        cost = 2.0 * jax.random.uniform(jax.random.key(5), (6, 4))
-        plan = solve(cost, epsilon=0.02, num_iterations=1)
-        np.testing.assert_allclose(plan.sum(1), 1.0 / 6.0, atol=1e-6)
-        assert np.abs(plan.sum(0) - 0.25).max() > 1e-2
-
-    def test_reordering_the_expert_reorders_columns(self):
-        cost = jax.random.uniform(jax.random.key(1), (6, 4))
-        order = jnp.array([2, 0, 3, 1])
-        np.testing.assert_allclose(
-            solve(cost[:, order]), solve(cost)[:, order], atol=1e-6
-        )
-
-    def test_a_constant_added_to_the_cost_changes_nothing(self):
-        cost = jax.random.uniform(jax.random.key(2), (5, 5))
-        np.testing.assert_allclose(solve(cost + 0.7), solve(cost), atol=1e-5)
-
     def test_small_epsilon_is_finite(self):
         cost = 2.0 * jax.random.uniform(jax.random.key(3), (50, 40))
         plan = solve(cost, epsilon=0.001, num_iterations=100)
         chex.assert_tree_all_finite(plan)
         np.testing.assert_allclose(plan.sum(1), 1.0 / 50.0, atol=1e-5)
-
-    def test_large_epsilon_forgets_the_cost(self):
-        plan = solve(jax.random.uniform(jax.random.key(4), (4, 5)), epsilon=1e3)
-        np.testing.assert_allclose(plan, np.full((4, 5), 1.0 / 20.0), atol=1e-4)
 
     def test_rejects_a_batch_of_costs(self):
         with pytest.raises(AssertionError):
@@ -145,9 +120,8 @@ class SinkhornPlanTest(chex.TestCase):
 
 
 class TransportRewardsTest(chex.TestCase):
-    @with_and_without_jit
     def test_by_hand(self):
-        rewards = self.variant(transport.transport_rewards)(
+        rewards = jax.jit(transport.transport_rewards)(
             jnp.array([[1.0, 2.0], [0.0, 4.0]]), jnp.array([[0.5, 0.0], [0.25, 0.25]])
         )
         np.testing.assert_allclose(rewards, [-0.5, -1.0])

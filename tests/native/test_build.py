@@ -1,8 +1,6 @@
 """Compiling the encoder in C: once, by which compiler, and messages if it fails."""
 
-import configparser
 import os
-import pathlib
 import stat
 
 import jax
@@ -83,16 +81,19 @@ build.register(ctypes.CDLL(str(path)))
 
 
 @pytest.mark.usefixtures("quick_compiler")
-@pytest.mark.parametrize("damage", ["empty", "truncated", "flipped"])
-def test_a_damaged_library_is_rebuilt(tmp_path, damage):
+def test_a_damaged_library_is_rebuilt(tmp_path):
     path = build.build(tmp_path)
     whole = path.read_bytes()
     half = len(whole) // 2
     flipped = whole[:half] + bytes([whole[half] ^ 1]) + whole[half + 1 :]
-    path.write_bytes({"empty": b"", "truncated": whole[:half]}.get(damage, flipped))
+    for damaged in (b"", flipped):
+        path.write_bytes(damaged)
+        assert build.build(tmp_path) == path
+        assert path.read_bytes() == whole
+    path.write_bytes(whole[:half])
     # Loading it would kill the process.
     run_python(_LOAD, str(tmp_path))
-    assert build._is_whole(path)
+    assert path.read_bytes() == whole
     assert os.listdir(tmp_path) == [path.name]
 
 
@@ -101,18 +102,6 @@ def test_another_processor_is_another_library(tmp_path, monkeypatch):
     path = build.build(tmp_path)
     monkeypatch.setattr(build.devices, "instruction_set", lambda: "flags : avx2 fma")
     assert build.build(tmp_path) != path
-
-
-def test_a_wheel_has_all_sources():
-    # Tests run from the tree, where a file that is not packed would not be missed.
-    root = pathlib.Path(build.__file__).parents[2]
-    setup = configparser.ConfigParser()
-    setup.read(root / "setup.cfg")
-    patterns = setup["options.package_data"]["jaxil"].split(",")
-    packed = {path for each in patterns for path in (root / "jaxil").glob(each.strip())}
-    sources = {*root.glob("jaxil/**/*.c"), *root.glob("jaxil/**/*.h")}
-    assert len(sources) > 1
-    assert sources <= packed
 
 
 @pytest.mark.usefixtures("quick_compiler")

@@ -13,12 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxil.machine import cache
 from jaxil.maths import convolution
 from jaxil.native import build, encoding
 from jaxil.native.encoding import Weights
 from tests.processes import run_python
-
-with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
 
 FEATURES = encoding.FEATURES
 LEARNER = ((3, 32, 2), (3, 32, 1), (3, 32, 1), (3, 32, 1))  # the paper's
@@ -88,7 +87,6 @@ def assert_same(drawn, tolerance=2e-5):
 
 
 class ByHandTest(chex.TestCase):
-    @with_and_without_jit
     def test_value_and_gradients_of_one_row(self):
         # One row of 3 pixels, a kernel of 2: of feature f it is (f, 1), its bias -12.
         f = jnp.arange(FEATURES, dtype=jnp.float32)
@@ -101,7 +99,7 @@ class ByHandTest(chex.TestCase):
                 pixels, jnp.float32(0.0), weights, contrast=255.0, strides=(1,)
             )
 
-        both: Any = self.variant(
+        both: Any = jax.jit(
             lambda w: jax.vjp(run, w)[1](jnp.ones((1, 1, 2, FEATURES)))[0]
         )
         # 1 f + 2 - 12 and 2 f + 3 - 12: open from f = 11 and from f = 5 on.
@@ -333,9 +331,10 @@ print("equal")
 
 
 @pytest.mark.parametrize("kind", ["x86-64-v3", "x86-64-v4"])
-def test_vectors_of_either_length_compute_the_same(kind, tmp_path):
+def test_vectors_of_either_length_compute_the_same(kind):
     flags = pathlib.Path("/proc/cpuinfo").read_text()
     if {"x86-64-v3": " avx2 ", "x86-64-v4": " avx512vl "}[kind] not in flags:
         pytest.skip(f"this processor is no {kind}")
     text = DRAWN + OTHER_PROCESSOR
-    assert run_python(text, "8", str(tmp_path), f"-march={kind}") == "equal\n"
+    folder = str(cache.compilation_folder())  # compiled once, also for later tests
+    assert run_python(text, "8", folder, f"-march={kind}") == "equal\n"

@@ -1,7 +1,5 @@
 """The trunk, the MLP and the actor: sizes by hand, layers by their definitions."""
 
-from typing import Any
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -11,8 +9,6 @@ from jaxil.networks.actor import Actor
 from jaxil.networks.agent import actor_features, apply
 from jaxil.networks.layers import MLP, Trunk
 from tests.tiny_agent import NETWORKS
-
-with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
 
 
 def num_parameters(tree):
@@ -40,7 +36,6 @@ def test_parameters_at_the_papers_size():
 
 
 class TrunkTest(chex.TestCase):
-    @with_and_without_jit
     def test_is_linear_then_layer_norm_then_tanh(self):
         trunk = Trunk(feature_dim=5)
         # Small inputs: their variance is near epsilon, so epsilon is seen.
@@ -62,13 +57,12 @@ class TrunkTest(chex.TestCase):
             scaled = centred / np.sqrt(y.var(axis=1, keepdims=True) + epsilon)
             return np.tanh(scaled * norm["scale"] + norm["bias"])
 
-        features = self.variant(trunk.apply)(params, x)
+        features = jax.jit(trunk.apply)(params, x)
         np.testing.assert_allclose(features, by_hand(1e-5), atol=1e-4)
         assert np.abs(by_hand(1e-5) - by_hand(1e-6)).max() > 1e-2
 
 
 class ActorTest(chex.TestCase):
-    @with_and_without_jit
     def test_head_is_two_relu_layers_and_a_linear_one(self):
         mlp = MLP(hidden_dim=6, output_dim=3)
         x = np.random.default_rng(0).normal(size=(4, 5)).astype(np.float32)
@@ -81,9 +75,7 @@ class ActorTest(chex.TestCase):
         layer = params["params"]["output"]
         expected = y @ layer["kernel"] + layer["bias"][None]
         assert expected.min() < 0.0  # no ReLU at the end
-        np.testing.assert_allclose(
-            self.variant(mlp.apply)(params, x), expected, atol=1e-5
-        )
+        np.testing.assert_allclose(jax.jit(mlp.apply)(params, x), expected, atol=1e-5)
 
     def test_acts_on_its_own_features(self):
         actor = Actor(action_dim=2, feature_dim=5, hidden_dim=6)

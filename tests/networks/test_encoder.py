@@ -17,8 +17,6 @@ from jaxil.networks.agent import apply
 from jaxil.networks.encoder import PixelEncoder, StateEncoder
 from jaxil.networks.layers import Trunk
 
-with_and_without_jit: Any = chex.variants(with_jit=True, without_jit=True)
-
 TINY = PixelEncoder(channels=(4, 4), kernel_sizes=(3, 3), strides=(2, 1))
 
 
@@ -58,7 +56,6 @@ class PaperSizeTest(chex.TestCase):
 
 
 class ArithmeticTest(chex.TestCase):
-    @with_and_without_jit
     def test_is_the_plain_chain_of_convolutions(self):
         images = random_images()
         params = TINY.init(jax.random.key(0), images)
@@ -75,7 +72,7 @@ class ArithmeticTest(chex.TestCase):
                 dimension_numbers=("NHWC", "HWIO", "NHWC"),
             )
             x = jnp.maximum(x + layer["bias"][None, None, None], 0.0)
-        features = self.variant(TINY.apply)(params, images)
+        features = jax.jit(TINY.apply)(params, images)
         np.testing.assert_allclose(features, x.reshape(2, -1), atol=1e-5)
 
     @parameterized.parameters((1.0, 0.5), (4.0, 0.25))
@@ -168,7 +165,6 @@ def test_bfloat16_computes_in_halves_and_keeps_float32():
 
 
 class NativeTest(chex.TestCase):
-    @with_and_without_jit
     def test_native_convolutions_change_neither_value_nor_gradients(self):
         assert build.problem() is None
         plain = PixelEncoder((32, 64), (3, 3), (2, 1))
@@ -183,7 +179,7 @@ class NativeTest(chex.TestCase):
 
             return jax.grad(weighted, has_aux=True)(params)
 
-        run: Any = self.variant(lambda p: both(plain.clone(native=True), p))
+        run: Any = jax.jit(lambda p: both(plain.clone(native=True), p))
         chex.assert_trees_all_close(
             run(params), both(plain, params), rtol=1e-4, atol=1e-4
         )

@@ -140,6 +140,7 @@ def test_all_of_a_window_by_hand():
     np.testing.assert_array_equal(batch.window.action[..., 0], [[10, 11, 12]] * 2)
     np.testing.assert_array_equal(batch.window.weight, [[1, 0.5, 0.125]] * 2)
     np.testing.assert_array_equal(batch.reward, [1 + 5 + 12.5] * 2)
+    np.testing.assert_array_equal(batch.discount, [1 / 16] * 2)
     np.testing.assert_array_equal(batch.next_observation, [[3]] * 2)
     # The same sample without windows is the same batch.
     plain = replay.sample(np.random.default_rng(0), 2)
@@ -189,32 +190,6 @@ def test_every_window_is_sampled_equally_often():
         counts[tuple(stack.tobytes() for stack in ends)] += 1
     # 1000 expected, standard deviation sqrt(6000 * 1/6 * 5/6) = 29: five of them.
     assert max(abs(count - 1000) for count in counts.values()) < 145
-
-
-def test_three_step_return_by_hand():
-    replay = make_replay(
-        observation_shape=(1,), observation_dtype=np.float32, frame_stack=1
-    )
-    replay.add_episode(
-        frames=np.array([[0], [1], [2], [3]], np.float32),
-        actions=np.array([[10, 0], [11, 0], [12, 0]], np.float32),
-        rewards=[1.0, 2.0, 4.0],
-        discounts=[1.0, 0.5, 0.0],
-    )
-
-    batch = replay.sample(np.random.default_rng(0), 2)
-
-    # gamma 0.5: 1 + (0.5 * 1) * 2 + (0.5 * 1) * (0.5 * 0.5) * 4 = 1 + 1 + 0.5. The last
-    # discount, 0, only concerns what follows: 0.5 * 0.25 * (0.5 * 0) = 0.
-    np.testing.assert_array_equal(batch.reward, np.array([2.5, 2.5], np.float32))
-    np.testing.assert_array_equal(batch.discount, np.array([0, 0], np.float32))
-    np.testing.assert_array_equal(batch.observation, np.array([[0], [0]], np.float32))
-    np.testing.assert_array_equal(
-        batch.next_observation, np.array([[3], [3]], np.float32)
-    )
-    np.testing.assert_array_equal(
-        batch.action, np.array([[10, 0], [10, 0]], np.float32)
-    )
 
 
 def test_a_time_limit_keeps_the_bootstrap():

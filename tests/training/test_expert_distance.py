@@ -53,7 +53,7 @@ def test_one_encoder_for_all():
     assert first.shape == (64, 50)
 
 
-@pytest.mark.parametrize("side", [3, 8, 15, 48])
+@pytest.mark.parametrize("side", [3, 15])
 def test_small_images_are_embedded_too(side):
     frames = np.zeros((4, side, side, 3), np.uint8)
     assert (

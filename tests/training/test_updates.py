@@ -306,24 +306,6 @@ def test_refreshed_rewards_are_those_of_now(tmp_path):
         assert np.ptp(np.asarray(rewards)) > 0
 
 
-def test_actions_of_several_are_those_of_each_with_noise_of_its_own_step(tmp_path):
-    run = make_run(tmp_path, num_environments=3, exploration_steps=10)
-    drawings = [Drawing() for _ in range(3)]
-    seen = np.stack([d.reset(n).observation for n, d in enumerate(drawings)])
-    for first in (4, 9, 20):  # uniform, both, the policy's
-        run.counters.num_steps = first
-        together = run.act(seen)
-        for index, observation in enumerate(seen):
-            run.counters.num_steps = first + index
-            alone = run.act(observation[None])
-            np.testing.assert_allclose(together[index], alone[0], rtol=0, atol=1e-5)
-    assert len(np.unique(together)) == together.size
-    # Fewer than there may be, at a run's end, act alike.
-    run.counters.num_steps = 20
-    np.testing.assert_array_equal(run.act(seen[:2]), together[:2])
-    run.log.close()
-
-
 def assert_copied(run):
     replay, copied = run.replay, np.asarray(run.updates.frames().agent)
     for number in replay.episodes:
@@ -344,13 +326,3 @@ class Reading:
 
 def _compilations(step: Any) -> int:
     return step._cache_size()
-
-
-def test_settings_of_speed_are_checked_at_the_door():
-    config = jaxil_config.default_config("pdac", "walker_walk")
-    config.update(updates_per_dispatch=0, compute_dtype="float16", num_environments=65)
-    said = [str(each) for each in jaxil_config.problems(config, ("walker_walk",))]
-    assert len(said) == 3
-    assert "updates_per_dispatch=0 must lie in [1, 1000]" in said[0]
-    assert "num_environments=65 must lie in [1, 64]" in said[1]
-    assert "compute_dtype='float16' is unknown; choose one of: float32" in said[2]

@@ -1,7 +1,5 @@
 """A run's folder, also when an older version of the project wrote it."""
 
-import errno
-import fcntl
 import json
 import os
 import time
@@ -117,17 +115,6 @@ def test_an_open_folder_is_in_use(tmp_path):
             pass
     with workdir.opened(tmp_path):
         pass
-
-
-def test_a_file_system_without_locks_will_do(tmp_path, monkeypatch):
-    def refuse(*_):
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    monkeypatch.setattr(fcntl, "flock", refuse)
-    with workdir.opened(tmp_path):
-        match = f"in use by process {os.getpid()} on"
-        with pytest.raises(UsageError, match=match), workdir.opened(tmp_path):
-            pass
 
 
 def test_leftovers_of_killed_processes_are_removed_at_the_start(tmp_path):
