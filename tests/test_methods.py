@@ -11,7 +11,7 @@ import pytest
 from jaxil import config as jaxil_config
 from jaxil import methods
 from jaxil.errors import UsageError
-from tests.commands import ROOT, call, small_run
+from tests.commands import ROOT, SMALL, call, small_run
 from tests.processes import run_python
 from tests.reporting.run_folders import write_run
 
@@ -125,23 +125,29 @@ def package(tmp_path, monkeypatch) -> pathlib.Path:
     return folder
 
 
-def test_a_method_from_outside_trains(package, tmp_path):
+def test_a_method_from_outside_is_swept_and_reported(package, tmp_path):
+    """No line of jaxil knows it, yet sweep, training and report do what they do."""
     del package
-    workdir = tmp_path / "run"
-    finished = call(
-        "launch",
-        *small_run("zero", workdir),
-        "--config.method=my_method:METHOD",
-        "--config.brightness.weight=0.5",
-        "--config.total_frames=1000",
+    swept = call(
+        "sweep",
+        *("--methods=my_method:METHOD", "--preset=tiny", "--tasks=ball_in_cup_catch"),
+        *("--seeds=1", "--workers=1", "--cluster=local", f"--workdir={tmp_path}"),
+        *(*SMALL, "--config.brightness.weight=0.5", "--config.total_frames=1000"),
     )
-    assert finished.returncode == 0, finished.stderr
+    assert swept.returncode == 0, swept.stdout + swept.stderr
+    (workdir,) = tmp_path.glob("ball_in_cup_catch/*/seed0")
     header, first, *_ = (workdir / "train.csv").read_text().splitlines()
     row = dict(zip(header.split(","), first.split(",")))
     assert float(row["brightness/weight"]) == 0.5
     # 100 agent steps of pictures that are neither black nor white.
     assert 0.0 < float(row["imitation_return"]) < 50.0
     assert list(workdir.glob("checkpoints/frame_*"))
+
+    output = tmp_path / "report"
+    trust = "--trust=my_method:METHOD"
+    reported = call("report", str(workdir), trust, f"--output={output}")
+    assert reported.returncode == 0, reported.stderr
+    assert "Bright" in (output / "index.html").read_text()
 
 
 def test_its_own_fields_are_checked_like_any_other(package, tmp_path):
