@@ -76,7 +76,7 @@ def collect(groups: Sequence[Group], per_group: int) -> tuple[list[Episode], lis
             name = f"episode{len(episodes) + 1}_{group.task}_{group.variant.slug}"
             sheet = _sheet(
                 path.with_suffix(".npz"),
-                re.sub(r"\W+", "_", name)[:100],
+                re.sub(r"\W+", "_", name, flags=re.ASCII)[:100],
                 group.look.colour,
                 left_out,
             )

@@ -16,6 +16,7 @@ _LINE_HEIGHT = 0.145  # inches
 BAR_MARGINS, REWARD_MARGINS = (0.1, 0.2), (0.72, 0.62)
 # Beyond this many times the height of the means, an interval is cut off.
 _BAND_ROOM = 1.25
+_NAME_ROOM = 0.07  # of the axis, for the name of a dashed line
 
 
 def curves(
@@ -31,14 +32,22 @@ def curves(
     Args:
       axes: Matplotlib's.
       lines: at least one.
-      levels: heights to mark with a dashed line, and their names.
+      levels: heights to mark with a dashed line, and their names; falling.
       over: "frame" or "hours".
       name: of the vertical axis.
     """
     for line in lines:
         _line(axes, line)
+    heights = [line.mean.value for line in lines] + [[value for value, _ in levels]]
+    bands = [end for line in lines for end in line.mean[1:]]
+    bottom, top = _vertical(np.concatenate(heights), np.concatenate(bands))
+    axes.set_ylim(bottom, top)
+    named = np.inf
     for value, text in levels:
         axes.axhline(value, color=INK, ls=(0, (4, 3)), lw=0.9, alpha=0.75, zorder=1)
+        if named - value < _NAME_ROOM * (top - bottom):
+            continue  # it would cover the name of the one above
+        named = value
         axes.annotate(
             text,
             (0.995, value),
@@ -50,9 +59,6 @@ def curves(
             fontsize=7.5,
             alpha=0.85,
         )
-    heights = [line.mean.value for line in lines] + [[value for value, _ in levels]]
-    bands = [end for line in lines for end in line.mean[1:]]
-    axes.set_ylim(*_vertical(np.concatenate(heights), np.concatenate(bands)))
     _horizontal(axes, max(float(line.x[-1]) for line in lines), over)
     axes.set_ylabel(name)
     axes.grid(axis="y", alpha=0.16, lw=0.6, color=INK)
