@@ -280,6 +280,8 @@ def test_the_same_runs_give_the_same_bytes(tmp_path):
     assert "&lt;b&gt;$x_1$&lt;i&gt; &amp; co" in text
     assert name not in text
     assert task in text
+    for panel in ("rewards", "transport plan", "alignment"):
+        assert f"<h4>{panel}</h4>" in text
     assert "runs are finished" not in text, "nobody asked for a number of seeds"
 
 
