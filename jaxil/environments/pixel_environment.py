@@ -165,7 +165,8 @@ class PixelEnvironment(dm_env.Environment):
         """Returns a new image, uint8 [H, W, 3], of the given size or the agent's."""
         images = _images_in(self._seen)
         image = images[0] if len(images) == 1 else self._rendered()
-        size = (image_size or self.image_size,) * 2
+        side = image_size or self.image_size
+        size = (side, side)
         if image.shape[:2] == size:
             return np.array(image)
         # Pillow's bilinear filter grows with the scale, which prevents aliasing.
