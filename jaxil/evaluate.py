@@ -3,7 +3,7 @@ r"""Evaluates the newest checkpoint of a run: returns, and a video.
     jaxil evaluate --workdir=runs/pdac --num_episodes=50
 
 The policy takes its mean action. The run is not changed. A video, WORKDIR/videos/
-evaluation_FRAME.mp4, shows another episode beside the expert's; --gif adds a GIF.
+evaluation_FRAME.mp4, shows the first episode beside the expert's; --gif adds a GIF.
 """
 
 import sys
@@ -33,12 +33,13 @@ def main(argv: list[str]) -> None:
     from jaxil.training import assembly, film, run_log, trained
 
     run = trained.load(folder)
-    gl_name = assembly.renderer_name(run.config)
+    films = assembly.renderer_name(run.config) != "none"
     evaluation = evaluate(
         run.environment,
         run.act,
         num_episodes=values.num_episodes,
         first_episode=_FIRST_EPISODE,
+        record=film.recorder(run.environment, values.video_size) if films else None,
     )
     for number, task_return in enumerate(evaluation.task_returns):
         print(f"episode {number}: {task_return:.1f}")
@@ -48,23 +49,25 @@ def main(argv: list[str]) -> None:
         f"{evaluation.mean:.1f}, std {evaluation.std:.1f}, minimum {returns.min():.1f},"
         f" maximum {returns.max():.1f}"
     )
-    has_expert = jaxil_config.uses_demonstrations(run.config)
-    if has_expert:
+    if jaxil_config.uses_demonstrations(run.config):
         try:
             expert_return = assembly.expert_return(run.config)
             if expert_return is not None:
                 line += f"; the expert's mean {expert_return:.1f}"
         except DemonstrationError as error:
-            has_expert = False
-            screen.say(f"without demonstrations: {error}")
+            if not films:  # else the video says it
+                screen.say(f"without demonstrations: {error}")
     print(line)
-    if gl_name == "none":
+    if not films:
         return
-    sides = [film.agent_side(run, values.video_size)]
-    if has_expert:
-        size = sides[0].frames.shape[1]
-        expert = assembly.load_shown_expert(run.config, size)
-        sides.append(film.expert_side(run, expert))
+    sides = film.sides(
+        run.config,
+        run.environment,
+        evaluation,
+        first_episode=_FIRST_EPISODE,
+        image_size=values.video_size,
+        shows_progress=True,
+    )
     frames, captions = zip(*sides)
     stem = folder / "videos" / f"evaluation_{run.act.frame:09d}"
     stem.parent.mkdir(exist_ok=True)

@@ -5,11 +5,14 @@ r"""Turns folders of runs into one page with figures, tables and videos.
 RUNS are folders; every folder with a config.json in or below them is a run, finished or
 not. Writes report/index.html, which needs no network, report/figures (PNG and SVG) and
 report/tables (CSV). Seeds are averaged with 90 % confidence intervals; runs with other
-settings are kept apart. An older report there is replaced.
+settings are kept apart. An older report there is replaced. With --watch=SECONDS it is
+written again and again, and the page in a browser follows, until Ctrl-C.
 """
 
+import contextlib
 import pathlib
 import sys
+import time
 
 from absl import flags
 
@@ -37,7 +40,17 @@ def main(argv: list[str]) -> None:
         faults += folder.problems(output)
     if faults:
         raise UsageError(faults)
+    _write(roots, output, values)
+    with contextlib.suppress(KeyboardInterrupt):
+        while values.watch:
+            time.sleep(values.watch)
+            _write(roots, output, values)
 
+
+def _write(
+    roots: list[pathlib.Path], output: pathlib.Path, values: flags.FlagValues
+) -> None:
+    """Reads the runs as they are now and writes their report."""
     from jaxil.reporting import assembly, runs
 
     found, unreadable = [], []
@@ -63,6 +76,7 @@ def main(argv: list[str]) -> None:
             unreadable=unreadable,
             num_seeds=values.seeds,
             num_videos=values.videos,
+            reload_seconds=values.watch,
         )
     except OSError as error:
         raise UsageError(
@@ -83,6 +97,7 @@ def _named_runs(argv: list[str]) -> list[str]:
                 "output",
                 "seeds",
                 "videos",
+                "watch",
                 "runs",
                 "trust",
             )
@@ -120,6 +135,14 @@ def _define(values: flags.FlagValues) -> None:
         1,
         "how many of the newest videos to show for each variant on each task",
         lower_bound=0,
+        flag_values=values,
+    )
+    flags.DEFINE_integer(
+        "watch",
+        None,
+        "seconds until the report is written again, over and over; Ctrl-C ends it",
+        lower_bound=1,
+        upper_bound=86_400,
         flag_values=values,
     )
 

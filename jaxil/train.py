@@ -264,6 +264,7 @@ class Run(Parts):
             counters.num_episodes,
             pre_tanh=float(counters.metrics.get("actor/pre_tanh", np.nan)),
             distance=result.distance,
+            sides=result.sides,
             filmed=result.filmed,
         )
         self.progress.message(line)

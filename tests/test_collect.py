@@ -86,17 +86,25 @@ def test_showing_a_video_leaves_it_as_it_is(tmp_path, monkeypatch):
     assert (tmp_path / "clip_episode0.mp4").exists()
 
 
-def test_the_sheet_shows_an_episode_from_first_to_last_frame():
-    # Frame t is of brightness 10 t: eight pictures of fifteen frames, evenly spaced.
-    brightness = np.arange(15, dtype=np.uint8) * 10
-    frames = np.broadcast_to(brightness[:, None, None, None], (15, 4, 4, 3))
-    summary = inspection.EpisodeSummary(15, "4x4", None, None)
-    pictures = [frames[inspection.spaced(15)]]
-    seen = inspection.Inspection({}, [summary], pictures, frames, 10.0)
+@pytest.mark.parametrize(
+    ("brightness", "expected"),
+    [
+        # One short event in a hundred frames, which even spacing would miss.
+        ([0] * 50 + [250] + [100] * 49, [0, 250, 100]),
+        # The first, the farthest, then halves.
+        (range(0, 150, 10), [0, 10, 30, 50, 70, 100, 120, 140]),
+        ([40] * 5, [40]),
+    ],
+)
+def test_the_sheet_shows_the_frames_that_differ_most(brightness, expected, tmp_path):
+    frames = np.array(brightness, np.uint8)[:, None, None, None]
+    path = tmp_path / "pixels.npy"
+    np.save(path, np.broadcast_to(frames, (len(frames), 8, 8, 3)))
+    seen = inspection.inspect(path, max_bytes=2**20, image_size=8)
     sheet = np.asarray(inspection.contact_sheet(seen))
     row = sheet[-20, :, 0]  # a line through the pictures
     shown = [value for value, _ in itertools.groupby(row.tolist()) if value != 24]
-    assert shown == [0, 20, 40, 60, 80, 100, 120, 140]
+    assert shown == expected
 
 
 # --- converting -----------------------------------------------------------------------

@@ -16,6 +16,7 @@ from jaxil import export
 from jaxil.files.tables import read_csv
 from jaxil.training import expert_distance, learning_curve, parts
 from tests.commands import ROOT, STATES, arguments, call, small_run
+from tests.demonstrations.foreign_files import open_video
 
 _CLOCKS = ("seconds", "frames_per_second", "reward_seconds")
 # Three episodes; rewards are refreshed at frames 2000 and 3000.
@@ -64,7 +65,11 @@ def test_pdac_trains_shows_itself_and_is_evaluated_again(unbroken):
     assert settings["versions"]["jax"]
     assert settings["renderer"]
     assert (unbroken / "learning_curve.png").stat().st_size > 5_000
-    assert list((unbroken / "videos").glob("*.mp4"))
+    films = sorted((unbroken / "videos").glob("frame_*.mp4"))
+    assert [film.stem for film in films] == ["frame_000002000", "frame_000004000"]
+    with open_video(films[0]) as container:
+        stream = container.streams.video[0]
+        assert (stream.width, stream.height) == (2 * 256 + 8, 256 + 22)
     assert list((unbroken / "tensorboard").iterdir())
 
     again = call(
@@ -142,6 +147,8 @@ def test_method_trains(method, tmp_path):
         filmed = _filmed(tmp_path)
         assert filmed["plan"].shape == (101, 101)
         np.testing.assert_allclose(filmed["plan"].sum(axis=1), 1 / 101, rtol=1e-3)
+        for name in ("agent_strip", "expert_strip"):
+            assert filmed[name].shape == (10, 24, 24, 3)
 
 
 @pytest.mark.usefixtures("plain")

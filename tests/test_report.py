@@ -155,7 +155,7 @@ def test_what_is_missing_of_the_papers_figures(folder):
     text = (folder / "index.html").read_text()
     # Of 8 tasks, 5 methods and 4 seeds: 3 + 2 on cartpole; 1 + 0 on walker, where the
     # two that differ in batch size have the same seed.
-    assert "6 of\n160 runs are finished" in text
+    assert "6 of 160 runs are finished" in text
     assert (
         "jaxil sweep --ablation=figure6 --tasks=cartpole_swingup,"
         "finger_spin,ball_in_cup_catch,acrobot_swingup,cheetah_run,walker_stand,"
@@ -258,8 +258,14 @@ def test_the_page_moves(folder, browser):
 
 def test_the_same_runs_give_the_same_bytes(tmp_path):
     name = "<b>$x_1$<i> & co"  # shown as it is
+    task = "é" * 190  # which no file's name has room for
     one = write_run(
-        tmp_path / "runs" / name, "psil", "hopper_hop", 0, {1000: 10, 3000: 20}
+        tmp_path / "runs" / name,
+        "psil",
+        "hopper_hop",
+        0,
+        {1000: 10, 3000: 20},
+        changes={"task": task},
     )
     film(one, 3000, plan=True)
     outputs = [tmp_path / "first", tmp_path / "second"]
@@ -273,6 +279,30 @@ def test_the_same_runs_give_the_same_bytes(tmp_path):
     text = (outputs[0] / "index.html").read_text()
     assert "&lt;b&gt;$x_1$&lt;i&gt; &amp; co" in text
     assert name not in text
+    assert task in text
+    for panel in ("rewards", "transport plan", "alignment"):
+        assert f"<h4>{panel}</h4>" in text
+    assert "runs are finished" not in text, "nobody asked for a number of seeds"
+
+
+def test_watching_writes_the_page_again_until_ctrl_c(tmp_path, monkeypatch):
+    write_run(tmp_path / "runs" / "first", "pdac", "walker_walk", 0, None)
+    slept = []
+
+    def sleep(seconds):
+        slept.append(seconds)
+        if len(slept) == 2:
+            raise KeyboardInterrupt
+        write_run(tmp_path / "runs" / "second", "pdac", "hopper_hop", 0, None)
+
+    monkeypatch.setattr(report.time, "sleep", sleep)
+    report.main(
+        ["report", str(tmp_path / "runs"), f"--output={tmp_path}/out", "--watch", "7"]
+    )
+    assert slept == [7, 7]
+    text = (tmp_path / "out" / "index.html").read_text()
+    assert "hopper_hop" in text
+    assert '<meta http-equiv="refresh" content="7">' in text
 
 
 def test_damaged_runs_do_not_end_the_report_of_the_others(tmp_path):

@@ -14,9 +14,10 @@ from jaxil.demonstrations.readers.recording import PixelEpisode, Recording
 from jaxil.environments import tasks
 from jaxil.errors import printable
 
-NUM_COLUMNS = 8  # images of an episode on the contact sheet
+_NUM_COLUMNS = 8  # images of an episode on the contact sheet, at most
 _NUM_ROWS = 10  # episodes on the contact sheet
 _MIN_SIDE = 96  # pixels of an image on the contact sheet
+_COMPARED = (16, 16)  # pixels, at which frames are compared
 _MARGIN = 4
 _CAPTION = 16
 _DEFAULT_FPS = 25.0
@@ -31,12 +32,19 @@ class EpisodeSummary(NamedTuple):
     task_return: float | None  # None without rewards
 
 
+class Picture(NamedTuple):
+    """One image on the contact sheet."""
+
+    time: int  # number of the frame in its episode
+    frame: np.ndarray  # uint8 [H, W, 3]
+
+
 class Inspection(NamedTuple):
     """The content of a file."""
 
     facts: dict[str, str]  # metadata as text, by label
     episodes: list[EpisodeSummary]
-    pictures: list[np.ndarray]  # spaced frames of ten episodes, uint8 [8, H, W, 3] each
+    pictures: list[list[Picture]]  # of ten episodes, the frames that differ most
     video: np.ndarray  # the first episode, uint8 [N + 1, H, W, 3]
     frames_per_second: float  # of the video
 
@@ -84,7 +92,8 @@ def inspect(
         frames, actions, rewards = episode.frames, episode.actions, episode.rewards
         height, width = episode.stored_size or frames.shape[1:3]
         if len(pictures) < _NUM_ROWS:
-            pictures.append(frames[spaced(len(frames))].copy())
+            times = most_different(np.stack([_small(frame) for frame in frames]))
+            pictures.append([Picture(int(t), frames[t].copy()) for t in times])
         if not summaries:
             video = frames
         summaries.append(
@@ -117,11 +126,16 @@ def _inspect_states(
     metadata = stored.metadata
     num_episodes, num_steps = stored.rewards.shape
     num_rows = min(num_episodes, _NUM_ROWS)
-    total = num_rows * NUM_COLUMNS + num_steps + 1
+    total = num_rows * _NUM_COLUMNS + num_steps + 1
     pictures = []
     for row in range(num_rows):
-        progress(row * NUM_COLUMNS, total)
-        pictures.append(_render(stored, row, spaced(num_steps + 1), view))
+        progress(row * _NUM_COLUMNS, total)
+        # Compared by their positions, since rendering all of them would take minutes.
+        positions = stored.simulator_states(slice(None), slice(row, row + 1))["qpos"][0]
+        scale = np.maximum(positions.std(axis=0), 1e-6)
+        times = most_different(positions / scale)
+        frames = _render(stored, row, times, view)
+        pictures.append([Picture(int(t), frame) for t, frame in zip(times, frames)])
     before = total - num_steps - 1
     view = {**view, "progress": lambda done, _: progress(before + done, total)}
     versions = ", ".join(f"{k} {v}" for k, v in metadata["versions"].items())
@@ -189,13 +203,13 @@ def table(inspection: Inspection) -> str:
 
 
 def contact_sheet(inspection: Inspection) -> Image.Image:
-    """Returns one row of images per episode, in order of time."""
-    height, width = inspection.pictures[0].shape[1:3]
+    """Returns one row of images per episode, in order of time, with their numbers."""
+    height, width = inspection.pictures[0][0].frame.shape[:2]
     scale = _MIN_SIDE / min(height, width)
     cell = (max(1, round(width * scale)), max(1, round(height * scale)))
     column_width, row_height = cell[0] + _MARGIN, cell[1] + _CAPTION + _MARGIN
     size = (
-        NUM_COLUMNS * column_width + _MARGIN,
+        _NUM_COLUMNS * column_width + _MARGIN,
         len(inspection.pictures) * row_height + _MARGIN,
     )
     sheet = Image.new("RGB", size, (24, 24, 24))
@@ -207,15 +221,42 @@ def contact_sheet(inspection: Inspection) -> Image.Image:
         if summary.task_return is not None:
             caption += f", return {summary.task_return:.0f}"
         draw.text((_MARGIN, top), caption, fill=(235, 235, 235))
-        for left, picture in zip(itertools.count(_MARGIN, column_width), pictures):
-            image = Image.fromarray(picture).resize(cell, Image.Resampling.BILINEAR)
+        for left, (time, frame) in zip(
+            itertools.count(_MARGIN, column_width), pictures
+        ):
+            image = Image.fromarray(frame).resize(cell, Image.Resampling.BILINEAR)
             sheet.paste(image, (left, top + _CAPTION))
+            corner = (left + 3, top + _CAPTION + 1)
+            draw.text(corner, str(time), (255, 255, 255), stroke_width=1, stroke_fill=0)
     return sheet
 
 
-def spaced(num_frames: int) -> np.ndarray:
-    """Returns the indices of 8 evenly spaced frames, including first and last."""
-    return np.linspace(0, num_frames - 1, NUM_COLUMNS).round().astype(int)
+def most_different(points: np.ndarray) -> np.ndarray:
+    """Returns the indices of points that differ most, in their order.
+
+    The first one, then whichever is farthest from all that were chosen before.
+
+    Args:
+      points: shape [N, D], N >= 1.
+
+    Returns:
+      At most 8 indices; fewer where all others equal one of them.
+    """
+    chosen = [0]
+    distances = np.full(len(points), np.inf)
+    for _ in range(_NUM_COLUMNS - 1):
+        nearer = np.square(points - points[chosen[-1]]).sum(axis=1)
+        distances = np.minimum(distances, nearer)
+        if not distances.any():
+            break
+        chosen.append(int(distances.argmax()))
+    return np.sort(chosen)
+
+
+def _small(frame: np.ndarray) -> np.ndarray:
+    """Returns a small grey image, flat, by which frames are compared."""
+    grey = Image.fromarray(frame).convert("L")
+    return np.asarray(grey.resize(_COMPARED, Image.Resampling.BOX), np.float32).ravel()
 
 
 def _fps(stored: states.StateDemonstrations) -> float:

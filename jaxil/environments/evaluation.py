@@ -16,7 +16,7 @@ class Evaluation(NamedTuple):
 
     episodes: list[Episode]  # with the task's rewards
     task_returns: np.ndarray  # undiscounted. Shape [E]
-    video: np.ndarray | None  # of the first episode, uint8 [T + 1, H, W, 3]
+    recorded: list[Any]  # of each moment of the first episode, [T + 1], or nothing
 
     @property
     def mean(self) -> float:
@@ -39,33 +39,32 @@ def evaluate(
     *,
     num_episodes: int,
     first_episode: int,
-    record_video: bool = False,
+    record: Callable[[], Any] | None = None,
     stop_asked: Callable[[], bool] = lambda: False,
 ) -> Evaluation:
     """Plays whole episodes.
 
     Args:
-      environment: an `Environment` used by nothing else, with `frame()` for videos.
+      environment: an `Environment` used by nothing else.
       act: the policy.
       num_episodes: at least 1.
       first_episode: number of the first episode; it determines the initial states.
-      record_video: whether to keep the first episode's images.
+      record: called at each moment of the first episode; None records nothing.
       stop_asked: called before each agent step; True raises `Stopped`.
     """
     player = Player(InProcess(environment), first_episode=first_episode)
     episodes: list[Episode] = []
-    images: list[np.ndarray] = []
+    recorded: list[Any] = []
     while len(episodes) < num_episodes:
         if stop_asked():
             raise Stopped
         began = player.begin(lambda _: True)
-        films = record_video and not episodes
-        if films and began:
-            images.append(environment.frame())
+        records = record if not episodes else None
+        if records and began:
+            recorded.append(records())
         player.step(np.asarray(act(player.observations[0]))[None])
         episodes += player.observe()
-        if films:
-            images.append(environment.frame())
+        if records:
+            recorded.append(records())
     returns = [episode.rewards.sum(dtype=np.float64) for episode in episodes]
-    video = np.stack(images) if record_video else None
-    return Evaluation(episodes, np.asarray(returns), video)
+    return Evaluation(episodes, np.asarray(returns), recorded)

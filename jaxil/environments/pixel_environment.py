@@ -161,11 +161,12 @@ class PixelEnvironment(dm_env.Environment):
         """Returns the current image, uint8 [H, W, 3], also in state mode."""
         return self.single_observation() if self._renders else self.render()
 
-    def render(self) -> np.ndarray:
-        """Returns a new image, uint8 [H, W, 3]."""
+    def render(self, image_size: int | None = None) -> np.ndarray:
+        """Returns a new image, uint8 [H, W, 3], of the given size or the agent's."""
         images = _images_in(self._seen)
         image = images[0] if len(images) == 1 else self._rendered()
-        size = (self.image_size, self.image_size)
+        side = image_size or self.image_size
+        size = (side, side)
         if image.shape[:2] == size:
             return np.array(image)
         # Pillow's bilinear filter grows with the scale, which prevents aliasing.

@@ -106,8 +106,9 @@ class SuiteEnvironment(PixelEnvironment):
         )
         self._distraction = Distraction(simulator.physics, camera, distraction)
 
-    def render(self) -> np.ndarray:
-        """Returns a new image, uint8 [H, W, 3]; RuntimeError without usable GL."""
+    def render(self, image_size: int | None = None) -> np.ndarray:
+        """Returns a new image of the agent's size; RuntimeError without usable GL."""
+        del image_size  # fixed when the camera is made
         if self._distraction.is_on:
             self.renderer.gl_name()  # opens the context
             self._distraction.upload()

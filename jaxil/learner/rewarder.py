@@ -129,7 +129,8 @@ class Rewarder(NamedTuple):
         loss and differentiated for `learner.actor`; the other networks of `learner`
         have made this update's step. None without.
       plan: (state, learner, episode, expert_episodes) -> the transport plan
-        [T + 1, N + 1] behind `rewards`, for reports; None without one.
+        [T + 1, N + 1] behind `rewards`, for reports, and the index of its
+        demonstration; None without one.
       summary: state -> scalars worth logging after an episode.
     """
 
@@ -156,7 +157,11 @@ class Rewarder(NamedTuple):
         | None
     ) = None
     plan: (
-        Callable[[RewarderState, LearnerParams, Episode, ExpertEpisodes], Array] | None
+        Callable[
+            [RewarderState, LearnerParams, Episode, ExpertEpisodes],
+            tuple[Array, Array],
+        ]
+        | None
     ) = None
     summary: Callable[[RewarderState], Metrics] = lambda state: {}
 

@@ -1,8 +1,10 @@
 """A progress line: position, speed and time left."""
 
 import contextlib
+import itertools
+import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TextIO
 
 from jaxil.machine.screen import LastingStream
@@ -10,6 +12,8 @@ from jaxil.machine.screen import LastingStream
 _TTY_SECONDS = 0.2  # between updates of a terminal's line, and of the speed
 _PLAIN_SECONDS = 30.0  # between lines in a log file
 _WINDOW_SECONDS = 60.0  # over which the speed is measured
+_SPARKS = "▁▂▃▄▅▆▇█"
+_NUM_SPARKS = 16
 
 
 class ProgressLine:
@@ -55,6 +59,8 @@ class ProgressLine:
             speed_estimate_period=_WINDOW_SECONDS,
             get_time=clock,
         )
+        self._newest: Mapping[str, float] = {}  # of the returns
+        self._history: list[float] = []
         self._label = f"{label}: " if label else ""
         self._unit = unit
         self._clock = clock
@@ -76,8 +82,12 @@ class ProgressLine:
         Args:
           frame: environment frames so far.
           seconds: spent so far by activity; what is missing is shown as "rest".
-          returns: last returns by name.
+          returns: those of the last episode by name, another mapping for each episode;
+            the first name's are shown as a sparkline, too.
         """
+        if returns and returns is not self._newest:
+            self._newest = returns
+            self._history.append(next(iter(returns.values())))
         now = self._clock()
         if now < self._next_update:
             return
@@ -122,10 +132,20 @@ class ProgressLine:
             parts.append(" ".join(f"{k} {100 * v:.0f}%" for k, v in shares.items()))
         if returns:
             shown = " ".join(f"{name} {value:.1f}" for name, value in returns.items())
-            parts.append(f"return {shown}")
+            parts.append(f"return {shown} {_sparkline(self._history)}")
         if speed > 0 and not task.finished:
             parts.append(f"{duration((task.remaining or 0.0) / speed)} left")
         return " | ".join(parts)
+
+
+def _sparkline(values: Sequence[float]) -> str:
+    """Returns a curve of at most 16 letters, each the mean of its share of values."""
+    count = min(len(values), _NUM_SPARKS)
+    ends = [len(values) * k // count for k in range(count + 1)]
+    means = [statistics.fmean(values[a:b]) for a, b in itertools.pairwise(ends)]
+    low, size = min(means), max(max(means) - min(means), 1e-9)
+    top = len(_SPARKS) - 1
+    return "".join(_SPARKS[round(top * (mean - low) / size)] for mean in means)
 
 
 @contextlib.contextmanager

@@ -3,7 +3,7 @@
 import pathlib
 from collections.abc import Sequence
 
-from jaxil.reporting import charts, episodes, figures, measures, page, paper, tables
+from jaxil.reporting import charts, episodes, measures, page, paper, tables
 from jaxil.reporting import folder as folders
 from jaxil.reporting.groups import Group, make_groups, short, tasks_of
 from jaxil.reporting.remarks import remarks
@@ -18,6 +18,7 @@ def write_report(
     unreadable: list[str],
     num_seeds: int | None,
     num_videos: int,
+    reload_seconds: int | None = None,
 ) -> None:
     """Writes index.html, figures/ and tables/ into a new folder.
 
@@ -27,6 +28,7 @@ def write_report(
       unreadable: sentences about runs that cannot be read.
       num_seeds: how many seeds each variant should have; None if unknown.
       num_videos: how many of each variant to show.
+      reload_seconds: after which browsers read the page again; None for never.
 
     Raises:
       OSError: it cannot be written.
@@ -50,12 +52,12 @@ def write_report(
         "distance": distance,
         "logits": charts.logit_sheet(groups, name="logits"),
     }
+    letters = tables.settings_table(groups)
     on_page = [
         tables.final_table(finals),
         tables.aggregate_table(finals),
         tables.efficiency_table(groups),
         tables.seed_table(groups, num_seeds),
-        tables.settings_table(groups),
         tables.run_table(groups),
     ]
     as_files = [
@@ -63,13 +65,16 @@ def write_report(
         tables.curve_table("learning_by_hours", hour_curves, "hours"),
         tables.curve_table("wasserstein", distances, "frame"),
     ]
-    paper_figures = paper.paper_figures(groups, num_seeds or figures.NUM_SEEDS)
+    paper_figures = paper.paper_figures(groups, num_seeds)
     sentences = [*unreadable, *remarks(groups), *left_out]
     index = page.html(
         {
             "heading": "Imitation from pixels: " + _tasks(groups),
             "facts": _facts(groups, len(sentences)),
+            "reload_seconds": reload_seconds,
             "shared": _shared(groups),
+            "legend": {group.label: group.look for group in groups if group.measured},
+            "letters": letters,
             **sheets,
             "paper": paper_figures,
             "episodes": films,
@@ -83,7 +88,7 @@ def write_report(
         for sheet in plotted:
             if sheet is not None:
                 write(sheet, folder / "figures")
-        for table in (*on_page, *as_files):
+        for table in (letters, *on_page, *as_files):
             if table.rows:
                 path = folder / "tables" / f"{table.name}.csv"
                 path.write_bytes(tables.to_csv(table))
@@ -93,13 +98,14 @@ def write_report(
 def _facts(groups: Sequence[Group], num_remarks: int) -> list[tuple[str, str]]:
     """Returns the numbers at the head of the page, with what they count."""
     runs = [run for group in groups for run in group.runs]
+    frames = sum(run.frames for run in runs)
     return [
         (f"{len(runs)}", "runs"),
         (f"{sum(run.is_finished for run in runs)}", "finished"),
         (f"{len({run.task for run in runs})}", "tasks"),
         (f"{len({run.variant.method for run in runs})}", "methods"),
         (f"{len({run.seed for run in runs})}", "seeds"),
-        (f"{sum(run.frames for run in runs) / 1e6:.2f} M", "frames"),
+        (f"{frames / 1e6:.2f} M" if frames >= 1e5 else f"{frames:,.0f}", "frames"),
         (f"{sum(run.seconds for run in runs) / 3600:.1f}", "hours"),
         (f"{num_remarks}", "warnings"),
     ]

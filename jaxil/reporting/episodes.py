@@ -17,9 +17,17 @@ from jaxil.reporting.sheets import Panel, Sheet
 _NAME = re.compile(r"frame_(\d{1,12})\.mp4")
 # Browsers refuse pages of hundreds of megabytes; a suite episode has about one.
 _MAX_BYTES_EACH, _MAX_BYTES = 20_000_000, 100_000_000
-_STORED = {"imitation_rewards", "task_rewards", "plan"}  # beside a video
+# What may be stored beside a video, and how many axes it has.
+_STORED = {
+    "imitation_rewards": 1,
+    "task_rewards": 1,
+    "plan": 2,
+    "step_seconds": 0,
+    "agent_strip": 4,
+    "expert_strip": 4,
+}
 _MAX_ARRAY_BYTES, _MAX_STEPS = 2**26, 100_000
-_REWARD_HEIGHT, _PLAN_HEIGHT = 1.75, 3.4  # inches
+_REWARD_HEIGHT, _PLAN_HEIGHT, _ALIGNMENT_HEIGHT = 1.75, 3.4, 2.6  # inches
 
 
 class Episode(NamedTuple):
@@ -30,7 +38,7 @@ class Episode(NamedTuple):
       run: whose.
       frame: environment frames of training when it was filmed.
       video: an MP4.
-      sheet: rewards, and the plan if there is one; None without them.
+      sheet: rewards, and plan and alignment if there are any; None without them.
     """
 
     group: Group
@@ -76,7 +84,7 @@ def collect(groups: Sequence[Group], per_group: int) -> tuple[list[Episode], lis
             name = f"episode{len(episodes) + 1}_{group.task}_{group.variant.slug}"
             sheet = _sheet(
                 path.with_suffix(".npz"),
-                re.sub(r"\W+", "_", name)[:100],
+                re.sub(r"\W+", "_", name, flags=re.ASCII)[:100],
                 group.look.colour,
                 left_out,
             )
@@ -118,43 +126,66 @@ def _sheet(
     if not path.exists():
         return None
     try:
-        names = _STORED & archive.member_names(path)
+        names = _STORED.keys() & archive.member_names(path)
         limits = dict.fromkeys(names, _MAX_ARRAY_BYTES)
-        imitation, task, plan = _arrays(archive.read_archive(path, max_bytes=limits))
+        stored = _arrays(archive.read_archive(path, max_bytes=limits))
     except (OSError, ValueError, TypeError) as error:
         left_out.append(f"{printable(path)} is left out: it {error}")
         return None
     panels = []
+    margins = plots.REWARD_MARGINS  # of all, so that times stand below each other
+    step_seconds = float(stored["step_seconds"]) if "step_seconds" in stored else None
+    imitation, task, plan = (
+        stored.get(name, np.zeros(0))
+        for name in ("imitation_rewards", "task_rewards", "plan")
+    )
     if np.isfinite(imitation).any():
         draw = functools.partial(
-            plots.rewards, imitation=imitation, task=task, colour=colour
+            plots.rewards,
+            imitation=imitation,
+            task=task if np.isfinite(task).any() else np.zeros(0),
+            colour=colour,
+            step_seconds=step_seconds,
         )
-        panels.append(Panel("rewards", draw, _REWARD_HEIGHT, plots.REWARD_MARGINS))
-    if plan.size:
-        draw = functools.partial(plots.plan, weights=plan)
-        # Below the rewards, with the same margins: agent steps are aligned.
-        panels.append(Panel("transport plan", draw, _PLAN_HEIGHT, plots.REWARD_MARGINS))
+        panels.append(Panel("rewards", draw, _REWARD_HEIGHT, margins))
+    if plan.any():
+        # Older runs stored columns for what other demonstrations have more.
+        plan = plan[:, : np.flatnonzero(plan.any(axis=0))[-1] + 1]
+        draw = functools.partial(plots.plan, weights=plan, step_seconds=step_seconds)
+        panels.append(Panel("transport plan", draw, _PLAN_HEIGHT, margins))
+        if {"agent_strip", "expert_strip"} <= stored.keys():
+            strips = (stored["agent_strip"], stored["expert_strip"])
+            draw = functools.partial(
+                plots.alignment,
+                weights=plan,
+                agent_strip=strips[0],
+                expert_strip=strips[1],
+                step_seconds=step_seconds,
+            )
+            panels.append(Panel("alignment", draw, _ALIGNMENT_HEIGHT, margins))
     return Sheet(name, tuple(panels)) if panels else None
 
 
-def _arrays(
-    stored: dict[str, np.ndarray],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the rewards and the plan of an archive, empty where there are none."""
-    kinds = {name: array.dtype.kind for name, array in stored.items()}
-    if not set(kinds.values()) <= set("fiub"):
-        raise ValueError("has arrays that are not of real numbers")
-    arrays = {name: array.astype(np.float64) for name, array in stored.items()}
-    for name, array in arrays.items():
-        if array.ndim != (2 if name == "plan" else 1):
+def _arrays(stored: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Returns the arrays of an archive, checked; films uint8, all others float64.
+
+    Raises:
+      ValueError: one of them is nothing that training writes.
+    """
+    for name, array in stored.items():
+        if array.dtype.kind not in "fiub":
+            raise ValueError("has arrays that are not of real numbers")
+        if array.ndim != _STORED[name]:
             raise ValueError(f"has an array {name} of {array.ndim} axes")
         if max(array.shape, default=0) > _MAX_STEPS:
             raise ValueError(f"has an array {name} of more than {_MAX_STEPS} steps")
-        if np.nanmax(np.abs(array), initial=0.0) > LARGEST:
+        if array.ndim == 4:
+            if array.dtype != np.uint8 or array.shape[-1] != 3 or not array.size:
+                raise ValueError(f"has an array {name} that is no film")
+            continue
+        stored[name] = array.astype(np.float64)
+        if np.nanmax(np.abs(stored[name]), initial=0.0) > LARGEST:
             raise ValueError(f"has an array {name} with numbers beyond any reward")
-    task = arrays.get("task_rewards", np.zeros(0))
-    return (
-        arrays.get("imitation_rewards", np.zeros(0)),
-        task if np.isfinite(task).any() else np.zeros(0),
-        arrays.get("plan", np.zeros((0, 0))),
-    )
+    if "plan" in stored:
+        stored["plan"] = np.clip(np.nan_to_num(stored["plan"]), 0.0, None)
+    return stored

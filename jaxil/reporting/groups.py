@@ -16,6 +16,7 @@ from jaxil.reporting.runs import Run, defaults_of
 
 _SAME_EXPERT = 1e-3  # relative; the renderer's rounding is far below
 _MAX_SHOWN = 60  # characters of one value
+_MAX_WORDS = 3  # of a label, beyond its method
 # Lines of one method: their dashes in line widths, marker, and lightness beside it.
 # Five and six have no common factor: thirty lines differ.
 _DASHES = ((), (4.0, 1.5), (1.0, 1.3), (5.0, 1.5, 1.0, 1.5), (7.0, 2.0), (2.5, 1.0))
@@ -50,9 +51,10 @@ class Group(NamedTuple):
     Attributes:
       task: such as "walker_walk".
       variant: the method with what an ablation changed.
-      settings: those that differ from the paper's and from other groups of the same
-        variant and task, such as "action_repeat 4".
-      label: the variant with its settings, or with a letter for several of them.
+      settings: those that differ from the paper's and from other runs of the same
+        variant, on any task, such as "action_repeat 4".
+      label: the variant with its setting, or with a letter for more than three words;
+        the same on every task.
       look: the same for all groups of this label.
       runs: by seed and folder, at least one.
     """
@@ -77,12 +79,12 @@ class Group(NamedTuple):
 
 def make_groups(runs: Iterable[Run]) -> list[Group]:
     """Sorts runs into groups, in the paper's order of tasks and methods."""
-    families: dict[tuple[str, str, str], list[Run]] = {}
+    families: dict[tuple[str, str], list[Run]] = {}
     for run in runs:
         variant = run.variant
-        families.setdefault((run.task, variant.method, variant.label), []).append(run)
+        families.setdefault((variant.method, variant.label), []).append(run)
     found: dict[tuple, list[Run]] = {}
-    for (task, method, label), family in families.items():
+    for (method, label), family in families.items():
         differing = differing_fields(family)
         for run in family:
             settings = tuple(
@@ -90,7 +92,7 @@ def make_groups(runs: Iterable[Run]) -> list[Group]:
                 for field, value in changes(run).items()
                 if field in differing
             )
-            found.setdefault((task, method, label, settings), []).append(run)
+            found.setdefault((run.task, method, label, settings), []).append(run)
     ordered = sorted(
         found.items(),
         key=lambda item: (
@@ -198,12 +200,13 @@ def _labels(keys: Iterable[tuple[str, str, tuple[str, ...]]]) -> dict[tuple, str
         method, label, settings = key
         if key in found:
             continue
-        if len(settings) > 1:
+        text = f"{label} ({', '.join(settings)})" if settings else label
+        plain = figures.declaration(method).label
+        if settings and len(text.removeprefix(plain).split()) > _MAX_WORDS:
             cycle, index = divmod(letters[method, label], len(string.ascii_uppercase))
             letters[method, label] += 1
-            found[key] = f"{label} ({string.ascii_uppercase[index]}{cycle or ''})"
-        else:
-            found[key] = f"{label} ({settings[0]})" if settings else label
+            text = f"{label} ({string.ascii_uppercase[index]}{cycle or ''})"
+        found[key] = text
     return found
 
 

@@ -39,12 +39,14 @@ class Final(NamedTuple):
       returns: of each measured run, in their order. Shape [S], S >= 1.
       mean: with Student's interval.
       expert: the mean return of the runs' own demonstrations; NaN without any.
+      shares: each return as a share of that run's own expert's, NaN without. Shape [S].
     """
 
     group: Group
     returns: np.ndarray
     mean: Estimate
     expert: float
+    shares: np.ndarray
 
 
 def curve(group: Group, x: str, y: str, *, table: str = "evaluation") -> Curve | None:
@@ -83,8 +85,10 @@ def final(group: Group) -> Final | None:
     if not group.measured:
         return None
     returns = np.array([run.returns[-1] for run in group.measured])
-    expert = float(np.mean([run.expert_return for run in group.measured]))
-    return Final(group, returns, statistics.mean_interval(returns), expert)
+    experts = np.array([run.expert_return for run in group.measured])
+    shares = returns / np.where(experts > 0, experts, np.nan)
+    mean = statistics.mean_interval(returns)
+    return Final(group, returns, mean, float(np.mean(experts)), shares)
 
 
 def arrivals(run: Run, x: str) -> list[float]:

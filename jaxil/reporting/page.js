@@ -15,6 +15,10 @@ for (const head of document.querySelectorAll("th")) {
     body.append(...rows);
   });
 }
+for (const box of document.querySelectorAll(".scroll")) {
+  box.closest("details").addEventListener("toggle", () =>
+    box.classList.toggle("wide", box.scrollWidth > box.clientWidth));
+}
 for (const episode of document.querySelectorAll(".episode")) {
   const video = episode.querySelector("video"), lines = [];
   for (const svg of episode.querySelectorAll("svg")) {

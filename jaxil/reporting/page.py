@@ -17,9 +17,10 @@ def html(content: dict[str, Any]) -> bytes:
     """Returns the whole file; all text is escaped.
 
     Args:
-      content: what the template names: heading, facts (numbers with what they count),
-        shared (settings unlike the paper's), by_frames, by_hours, bars, distance and
-        logits (sheets or None), paper (`PaperFigure`s), episodes, tables and remarks.
+      content: what the template names: heading, reload_seconds (or None), facts
+        (numbers with what they count), shared (settings unlike the paper's), legend,
+        letters (a table), by_frames, by_hours, bars, distance and logits (sheets or
+        None), paper (`PaperFigure`s), episodes, tables and remarks.
     """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(pathlib.Path(__file__).parent),
@@ -29,13 +30,21 @@ def html(content: dict[str, Any]) -> bytes:
     )
     prefixes = (f"s{number}" for number in itertools.count())
 
-    def svg(panel: Panel) -> Markup:
-        return Markup(inline_svg(panel, next(prefixes)))
+    captions: set[str] = set()
+
+    def svg(panel: Panel, columns: int) -> Markup:
+        return Markup(inline_svg(panel, next(prefixes), columns))
+
+    def once(caption: str) -> str:
+        is_new = caption not in captions
+        captions.add(caption)
+        return caption if is_new else ""
 
     page = environment.get_template("page.html.jinja").render(
         **content,
         mark=Markup(MARK),
         svg=svg,
+        once=once,
         base64=lambda video: base64.b64encode(video).decode(),
         title=tables.title,
         is_number=tables.is_number,

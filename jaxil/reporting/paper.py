@@ -1,4 +1,4 @@
-"""The paper's figures: finished and missing runs, and the command for those."""
+"""The paper's figures: those that these runs show, and the commands for the rest."""
 
 from typing import NamedTuple
 
@@ -13,54 +13,53 @@ class PaperFigure(NamedTuple):
 
     Attributes:
       figure: which.
-      sheet: the plots; None without suitable runs.
-      num_finished: finished seeds of all tasks and variants, none beyond those wanted.
-      num_wanted: how many there should be.
-      command: trains what is missing; empty if nothing is.
+      sheet: the plots; None without two methods or variants to compare.
+      lacks: what is missing; empty if nothing is.
+      command: trains it.
     """
 
     figure: Figure
     sheet: Sheet | None
-    num_finished: int
-    num_wanted: int
+    lacks: str
     command: str
 
 
-def paper_figures(groups: list[Group], num_seeds: int) -> list[PaperFigure]:
+def paper_figures(groups: list[Group], num_seeds: int | None) -> list[PaperFigure]:
     """Returns all figures of the paper's experiments.
 
     Args:
       groups: of all runs; those with other settings than the paper's are plotted, too.
-      num_seeds: how many each line should have, at least 1.
+      num_seeds: how many each line should have; None asks for one run of each figure.
     """
     return [_figure(groups, each, num_seeds) for each in figures.FIGURES.values()]
 
 
-def _figure(groups: list[Group], figure: Figure, num_seeds: int) -> PaperFigure:
+def _figure(groups: list[Group], figure: Figure, num_seeds: int | None) -> PaperFigure:
     own = [
         group
         for group in groups
         if group.task in figures.TASKS and group.variant in figure.variants
     ]
+    labels = {group.variant.label for group in own if group.measured}
+    # An ablation needs more than plain methods.
+    is_shown = len(labels) > 1 and (
+        not figure.is_ablation or any(group.variant.overrides for group in own)
+    )
+    sheet = _sheet(figure, own) if is_shown else None
+    command = f"jaxil sweep --ablation=figure{figure.number}"
+    if num_seeds is None:
+        lacks = "" if sheet else "no runs to compare"
+        return PaperFigure(figure, sheet, lacks, f"{command} --workdir=DIR")
     missing, num_finished = [], 0
     for task in figures.TASKS:
         counts = [_num_finished(own, task, v, num_seeds) for v in figure.variants]
         num_finished += sum(counts)
         if min(counts) < num_seeds:
             missing.append(task)
-    command = (
-        f"jaxil sweep --ablation=figure{figure.number} "
-        f"--tasks={','.join(missing)} --seeds={num_seeds} --workdir=DIR"
-    )
-    # An ablation needs more than the plain method.
-    shows = not figure.is_ablation or any(group.variant.overrides for group in own)
-    return PaperFigure(
-        figure,
-        _sheet(figure, own) if shows else None,
-        num_finished,
-        len(figure.variants) * len(figures.TASKS) * num_seeds,
-        command if missing else "",
-    )
+    num_wanted = len(figure.variants) * len(figures.TASKS) * num_seeds
+    lacks = f"{num_finished} of {num_wanted} runs are finished" if missing else ""
+    command += f" --tasks={','.join(missing)} --seeds={num_seeds} --workdir=DIR"
+    return PaperFigure(figure, sheet, lacks, command)
 
 
 def _num_finished(

@@ -16,6 +16,10 @@ _LINE_HEIGHT = 0.145  # inches
 BAR_MARGINS, REWARD_MARGINS = (0.1, 0.2), (0.72, 0.62)
 # Beyond this many times the height of the means, an interval is cut off.
 _BAND_ROOM = 1.25
+_NAME_ROOM = 0.07  # of the axis, for the name of a dashed line
+# Of an alignment: moments of the agent that have lines, the height of a film strip, and
+# the widths of the lightest and the heaviest line.
+_MATCHED, _STRIP, _LINE_WIDTHS = 60, 0.27, (0.25, 2.5)
 
 
 def curves(
@@ -31,14 +35,22 @@ def curves(
     Args:
       axes: Matplotlib's.
       lines: at least one.
-      levels: heights to mark with a dashed line, and their names.
+      levels: heights to mark with a dashed line, and their names; falling.
       over: "frame" or "hours".
       name: of the vertical axis.
     """
     for line in lines:
         _line(axes, line)
+    heights = [line.mean.value for line in lines] + [[value for value, _ in levels]]
+    bands = [end for line in lines for end in line.mean[1:]]
+    bottom, top = _vertical(np.concatenate(heights), np.concatenate(bands))
+    axes.set_ylim(bottom, top)
+    named = np.inf
     for value, text in levels:
         axes.axhline(value, color=INK, ls=(0, (4, 3)), lw=0.9, alpha=0.75, zorder=1)
+        if named - value < _NAME_ROOM * (top - bottom):
+            continue  # it would cover the name of the one above
+        named = value
         axes.annotate(
             text,
             (0.995, value),
@@ -50,9 +62,6 @@ def curves(
             fontsize=7.5,
             alpha=0.85,
         )
-    heights = [line.mean.value for line in lines] + [[value for value, _ in levels]]
-    bands = [end for line in lines for end in line.mean[1:]]
-    axes.set_ylim(*_vertical(np.concatenate(heights), np.concatenate(bands)))
     _horizontal(axes, max(float(line.x[-1]) for line in lines), over)
     axes.set_ylabel(name)
     axes.grid(axis="y", alpha=0.16, lw=0.6, color=INK)
@@ -123,7 +132,13 @@ def logits(axes: Any, pairs: Sequence[tuple[Curve, Curve]]) -> None:
     axes.grid(axis="y", alpha=0.16, lw=0.6, color=INK)
 
 
-def rewards(axes: Any, imitation: np.ndarray, task: np.ndarray, colour: str) -> None:
+def rewards(
+    axes: Any,
+    imitation: np.ndarray,
+    task: np.ndarray,
+    colour: str,
+    step_seconds: float | None,
+) -> None:
     """Plots the rewards of one episode.
 
     Args:
@@ -131,41 +146,104 @@ def rewards(axes: Any, imitation: np.ndarray, task: np.ndarray, colour: str) -> 
       imitation: what the agent learns from. Shape [T].
       task: the true reward, which it never sees. Shape [T] or empty.
       colour: of the imitation reward.
+      step_seconds: of an agent step; None if unknown.
     """
-    axes.plot(np.arange(len(imitation)), imitation, color=colour, lw=1.1)
+    step, unit = _time(step_seconds)
+    times = step * np.arange(max(len(imitation), len(task)))
+    axes.plot(times[: len(imitation)], imitation, color=colour, lw=1.1)
     axes.set_ylabel("imitation reward", color=colour)
-    axes.set_xlim(0, max(len(imitation), 2))
-    axes.set_xlabel("agent step")
+    axes.set_xlim(0, step * max(len(imitation), 2))
+    axes.set_xlabel(f"agent{unit}")
     if len(task):
         other = axes.twinx()
-        other.plot(np.arange(len(task)), task, color=INK, lw=0.9, alpha=0.6)
+        other.plot(times[: len(task)], task, color=INK, lw=0.9, alpha=0.6)
         other.set_ylabel("task reward")
         other.set_ylim(min(0.0, float(np.nanmin(task))))
         other.spines[["top", "left"]].set_visible(False)
 
 
-def plan(axes: Any, weights: np.ndarray) -> None:
-    """Plots a transport plan: which expert frame each agent frame is matched with.
+def plan(axes: Any, weights: np.ndarray, step_seconds: float | None) -> None:
+    """Plots a transport plan: which expert frames each agent frame is matched with.
 
     Args:
       axes: Matplotlib's.
       weights: at least 0. Shape [T + 1, N + 1].
+      step_seconds: of an agent step; None if unknown.
     """
     from matplotlib.colors import PowerNorm
 
-    shown = np.nan_to_num(weights)
-    norm = PowerNorm(0.5, vmin=0.0, vmax=max(float(shown.max()), 1e-12))
-    axes.imshow(
-        shown.T,
+    shares = _shares(weights)
+    step, unit = _time(step_seconds)
+    image = axes.imshow(
+        shares.T,
         origin="lower",
         aspect="auto",
         cmap="magma",
-        norm=norm,
+        norm=PowerNorm(0.5, vmin=0.0, vmax=float(shares.max())),
         interpolation="nearest",
-        extent=(0, shown.shape[0], 0, shown.shape[1]),
+        extent=(0, step * shares.shape[0], 0, step * shares.shape[1]),
     )
-    axes.set_xlabel("agent step")
-    axes.set_ylabel("expert step")
+    axes.set_xlabel(f"agent{unit}")
+    axes.set_ylabel(f"expert{unit}")
+    scale = axes.inset_axes((1.025, 0, 0.03, 1))
+    axes.figure.colorbar(image, cax=scale).set_label("share", labelpad=2)
+
+
+def alignment(
+    axes: Any,
+    weights: np.ndarray,
+    agent_strip: np.ndarray,
+    expert_strip: np.ndarray,
+    step_seconds: float | None,
+) -> None:
+    """Plots a transport plan as lines between two film strips.
+
+    Each of some moments of the agent has a line to the expert's that most of it goes
+    to, as wide as that share, in a colour that tells its time.
+
+    Args:
+      axes: Matplotlib's.
+      weights: at least 0. Shape [T + 1, N + 1].
+      agent_strip: evenly spaced frames from first to last, uint8 [n, H, W, 3].
+      expert_strip: the same of the expert.
+      step_seconds: of an agent step; None if unknown.
+    """
+    from matplotlib import colormaps
+    from matplotlib.collections import LineCollection
+
+    shares = _shares(weights)
+    step, unit = _time(step_seconds)
+    ends = [step * size for size in shares.shape]
+    for strip, end, low in (
+        (agent_strip, ends[0], 1.0 - _STRIP),
+        (expert_strip, ends[1], 0.0),
+    ):
+        extent = (0, end, low, low + _STRIP)
+        axes.imshow(np.concatenate([*strip], axis=1), extent=extent, aspect="auto")
+    lines, widths, colours = [], [], []
+    rows = np.linspace(0, len(shares) - 1, min(_MATCHED, len(shares))).round()
+    for row in rows.astype(int):
+        column = int(shares[row].argmax())
+        lines.append([(step * row, 1.0 - _STRIP), (step * column, _STRIP)])
+        widths.append(np.interp(shares[row, column], (0.0, 1.0), _LINE_WIDTHS))
+        colours.append(colormaps["viridis"](row / len(shares)))
+    axes.add_collection(LineCollection(lines, linewidths=widths, colors=colours))
+    axes.set_xlim(0, max(ends))
+    axes.set_ylim(0, 1)
+    axes.set_yticks([_STRIP / 2, 1 - _STRIP / 2], ["expert", "agent"])
+    axes.tick_params(axis="y", length=0)
+    axes.spines["left"].set_visible(False)
+    axes.set_xlabel(unit.strip(" ,"))
+
+
+def _shares(weights: np.ndarray) -> np.ndarray:
+    """Returns what part of each agent frame's mass goes where: rows with sum 1."""
+    return weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
+
+
+def _time(step_seconds: float | None) -> tuple[float, str]:
+    """Returns the length of a step on an axis, and how the axis is named."""
+    return (step_seconds, ", seconds") if step_seconds else (1.0, " step")
 
 
 def _line(axes: Any, line: Curve) -> None:

@@ -11,7 +11,9 @@ from jaxil.reporting.plots import INK
 
 # In inches. Positions are computed, since Matplotlib's layout engines take twice as
 # long as everything else.
-_WIDTH, _HEIGHT = 4.3, 2.85  # of a panel
+_WIDTH, _HEIGHT = 4.3, 2.85  # of a panel in three columns
+_FEWER_WIDTH = 10.0  # of all panels in fewer columns, which fill the same width
+_FEWER_HEIGHT = 3.6
 _MARGINS = (0.64, 0.14)  # left and right of the axes
 _TOP, _TITLE, _BOTTOM = 0.12, 0.24, 0.46  # above and below them
 _LEGEND_LINE = 0.19
@@ -43,13 +45,13 @@ class Panel(NamedTuple):
     Attributes:
       title: such as the task.
       draw: plots it onto Matplotlib's axes.
-      height: in inches.
+      height: in inches; None for that of curves.
       margins: left and right of the axes, in inches.
     """
 
     title: str
     draw: Callable[[Any], None]
-    height: float = _HEIGHT
+    height: float | None = None
     margins: tuple[float, float] = _MARGINS
 
 
@@ -69,15 +71,16 @@ class Sheet(NamedTuple):
     caption: str = ""
 
 
-def inline_svg(panel: Panel, prefix: str) -> str:
+def inline_svg(panel: Panel, prefix: str, columns: int) -> str:
     """Returns a panel as an <svg> element in the page's colour and font.
 
     Args:
       panel: what to plot.
       prefix: of all ids in it, unique on the page.
+      columns: panels beside each other on a wide page.
     """
     with _context({"svg.fonttype": "none"}):
-        figure, axes = _figure([panel], title=0.0)
+        figure, axes = _figure([panel], title=0.0, beside=columns)
         panel.draw(axes[0])
         text = _saved(figure, "svg", transparent=True).decode()
     text = text[text.index("<svg") :]
@@ -94,7 +97,9 @@ def inline_svg(panel: Panel, prefix: str) -> str:
 def write(sheet: Sheet, folder: pathlib.Path) -> None:
     """Writes NAME.png and NAME.svg."""
     with _context({"svg.fonttype": "path"}):
-        figure, axes = _figure(sheet.panels, sheet.legend, title=_TITLE)
+        figure, axes = _figure(
+            sheet.panels, sheet.legend, title=_TITLE, beside=len(sheet.panels)
+        )
         for panel, ax in zip(sheet.panels, axes, strict=True):
             panel.draw(ax)
             ax.set_title(panel.title)
@@ -113,28 +118,37 @@ def _figure(
     legend: Sequence[tuple[str, Look]] = (),
     *,
     title: float,
+    beside: int = _COLUMNS,
 ) -> tuple[Any, list[Any]]:
-    """Returns a figure with axes for each panel, and its legend."""
+    """Returns a figure with axes for each panel, and its legend.
+
+    `beside` is how many panels there are beside each other, at most.
+    """
     # Not pyplot: a separate Figure needs no display and leaves no global state.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
     columns = min(_COLUMNS, len(panels))
+    is_wide = beside < _COLUMNS
+    each_width = _FEWER_WIDTH / beside if is_wide else _WIDTH
+    usual = _FEWER_HEIGHT if is_wide else _HEIGHT
+    heights = [panel.height or usual for panel in panels]
     is_long = any(len(label) > _LEGEND_WIDTH for label, _ in legend)
     legend_columns = 1 if is_long else columns
     legend_height = _LEGEND_LINE * -(-len(legend) // legend_columns)
     firsts = range(0, len(panels), columns)
-    rows = [title + max(p.height for p in panels[k : k + columns]) for k in firsts]
-    width, height = _WIDTH * columns, sum(rows) + legend_height
+    rows = [title + max(heights[k : k + columns]) for k in firsts]
+    width, height = each_width * columns, sum(rows) + legend_height
     figure = Figure(figsize=(width, height), dpi=150)
     FigureCanvasAgg(figure)
     axes = []
     for index, panel in enumerate(panels):
         row, column = divmod(index, columns)
         left, right = panel.margins
-        across, high = _WIDTH - left - right, panel.height - _TOP - _BOTTOM
-        x, y = column * _WIDTH + left, height - sum(rows[:row]) - title - _TOP - high
+        across, high = each_width - left - right, heights[index] - _TOP - _BOTTOM
+        x = column * each_width + left
+        y = height - sum(rows[:row]) - title - _TOP - high
         box = (x / width, y / height, across / width, high / height)
         axes.append(figure.add_axes(box))
     if legend:

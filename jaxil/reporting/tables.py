@@ -134,9 +134,7 @@ def final_table(finals: Sequence[Final]) -> Table:
             **_interval("iqm", statistics.interquartile_interval([each.returns])),
             "median": np.median(each.returns),
             "expert": each.expert,
-            "share_of_expert": each.mean.value / each.expert
-            if each.expert > 0
-            else _NAN,
+            "share_of_expert": np.mean(each.shares),
         }
         for each in finals
     ]
@@ -152,8 +150,8 @@ def aggregate_table(finals: Sequence[Final]) -> Table:
     """Returns each variant over its tasks, at least two, in shares of their experts."""
     labels: dict[str, list[np.ndarray]] = {}
     for each in finals:
-        if each.expert > 0:
-            labels.setdefault(each.group.label, []).append(each.returns / each.expert)
+        if np.isfinite(each.shares).all():
+            labels.setdefault(each.group.label, []).append(each.shares)
     rows = []
     for label, strata in labels.items():
         if len(strata) < 2:
@@ -223,10 +221,14 @@ def seed_table(groups: Sequence[Group], num_seeds: int | None) -> Table:
 
 
 def settings_table(groups: Sequence[Group]) -> Table:
-    """Returns what the words and letters behind a variant's name stand for."""
-    settings = {g.label: ", ".join(g.settings) for g in groups if g.settings}
+    """Returns what the letters behind a variant's name stand for."""
+    settings = {
+        group.label: ", ".join(group.settings)
+        for group in groups
+        if group.settings and not group.label.endswith(f"({', '.join(group.settings)})")
+    }
     rows = [{"variant": label, "settings": text} for label, text in settings.items()]
-    return Table("settings", "Settings of variants", rows)
+    return Table("settings", "Settings behind the letters", rows)
 
 
 def run_table(groups: Sequence[Group]) -> Table:

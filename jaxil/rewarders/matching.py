@@ -38,10 +38,11 @@ class Matching(NamedTuple):
         """
         return closest_rewards(*self._costs_and_plans(agent, experts, num_moments))
 
-    def closest_plan(self, agent: Array, experts: Array, num_moments: Array) -> Array:
-        """Returns the plan behind `rewards`. Shape [T, N]."""
-        costs, plans = self._costs_and_plans(agent, experts, num_moments)
-        return plans[jnp.argmin(jnp.sum(costs * plans, axis=(1, 2)))]
+    def closest_plan(
+        self, agent: Array, experts: Array, num_moments: Array
+    ) -> tuple[Array, Array]:
+        """Returns the plan behind `rewards`, [T, N], and its demonstration's index."""
+        return cheapest(*self._costs_and_plans(agent, experts, num_moments))
 
     def _costs_and_plans(
         self, agent: Array, experts: Array, num_moments: Array
@@ -53,6 +54,12 @@ class Matching(NamedTuple):
             num_moments, experts.shape[1]
         )
         return costs, jax.vmap(self.plan)(costs, masses)
+
+
+def cheapest(costs: Array, plans: Array) -> tuple[Array, Array]:
+    """Returns the cheapest plan, [T, N], and its index; both arguments [K, T, N]."""
+    index = jnp.argmin(jnp.sum(costs * plans, axis=(1, 2)))
+    return plans[index], index
 
 
 def closest_rewards(costs: Array, plans: Array) -> Array:

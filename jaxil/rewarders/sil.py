@@ -172,7 +172,7 @@ def make_rewarder(
         learner: LearnerParams,
         episode: Episode,
         expert_episodes: ExpertEpisodes,
-    ) -> Array:
+    ) -> tuple[Array, Array]:
         del learner
         mine, experts = features(state, episode, expert_episodes)
         return matching.closest_plan(mine, experts, expert_episodes.num_frames)

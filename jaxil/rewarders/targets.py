@@ -1,6 +1,7 @@
 """What methods share that compare episodes under target copies of the actor's trunk."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +16,9 @@ from jaxil.networks.agent import actor_features
 from jaxil.rewarders.matching import scale_of_first_episode
 
 # (agent features [T + 1, D], expert features [K, N + 1, D], frames of each that are its
-# own [K]) -> rewards [T + 1] of o_0 ... o_T, or a plan [T + 1, N + 1].
-Compare = Callable[[Array, Array, Array], Array]
+# own [K]) -> rewards [T + 1] of o_0 ... o_T, or a plan [T + 1, N + 1] and the index of
+# its demonstration.
+Compare = Callable[[Array, Array, Array], Any]
 
 
 class TargetState(struct.PyTreeNode):
@@ -97,7 +99,7 @@ def make_target_rewarder(
         state: TargetState,
         episode: Episode,
         expert_episodes: ExpertEpisodes | None,
-    ) -> Array:
+    ) -> Any:
         assert expert_episodes is not None
         features = embed(state.target_encoder, state.target_actor, episode.frames)
         return compared(features, state.expert_features, expert_episodes.num_frames)
@@ -147,7 +149,7 @@ def make_target_rewarder(
         learner: LearnerParams,
         episode: Episode,
         expert_episodes: ExpertEpisodes,
-    ) -> Array:
+    ) -> tuple[Array, Array]:
         del learner
         assert plan is not None
         return unscaled(plan, state, episode, expert_episodes)

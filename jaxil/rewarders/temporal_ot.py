@@ -10,7 +10,7 @@ from jax import Array
 from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, Rewarder
 from jaxil.maths import transport
-from jaxil.rewarders.matching import closest_rewards
+from jaxil.rewarders.matching import cheapest, closest_rewards
 from jaxil.rewarders.targets import make_target_rewarder
 
 METHOD = methods.Method(
@@ -87,9 +87,8 @@ def make_rewarder(
     def rewards(agent: Array, experts: Array, num_moments: Array) -> Array:
         return closest_rewards(*match(agent, experts, num_moments))
 
-    def plan(agent: Array, experts: Array, num_moments: Array) -> Array:
-        costs, plans = match(agent, experts, num_moments)
-        return plans[jnp.argmin(jnp.sum(costs * plans, axis=(1, 2)))]
+    def plan(agent: Array, experts: Array, num_moments: Array) -> tuple[Array, Array]:
+        return cheapest(*match(agent, experts, num_moments))
 
     return make_target_rewarder(
         agent,

@@ -184,21 +184,22 @@ def load_demonstrations(config: Config) -> loading.Demonstrations | None:
         )
 
 
-def load_shown_expert(config: Config, image_size: int) -> loading.Demonstrations:
+def load_shown_expert(
+    config: Config, image_size: int, progress: Callable[[int, int], None] | None
+) -> loading.Demonstrations:
     """Returns the first demonstration, large enough for people.
 
     Raises:
       DemonstrationError: the file does not fit this run.
     """
     shown_as = {"image_size": image_size, "observation": "pixels", "num_episodes": 1}
-    with shown("rendering the expert's episode, once") as show:
-        return loading.load(
-            config.demonstrations.source,
-            render_quality=config.render_quality,
-            camera=config.camera,
-            progress=show,
-            **(_file_settings(config) | shown_as),
-        )
+    return loading.load(
+        config.demonstrations.source,
+        render_quality=config.render_quality,
+        camera=config.camera,
+        progress=progress,
+        **(_file_settings(config) | shown_as),
+    )
 
 
 def expert_return(config: Config) -> float | None:

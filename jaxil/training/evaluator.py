@@ -10,8 +10,11 @@ from jaxil.environments.evaluation import Evaluation, Stopped, evaluate
 from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.learner.state import TrainState
 from jaxil.maths.types import Episode, ExpertEpisodes
+from jaxil.training import film
 from jaxil.training.agent import Agent
 from jaxil.training.expert_distance import ExpertDistance
+
+_STRIP_FRAMES = 10
 
 
 class Result(NamedTuple):
@@ -20,11 +23,13 @@ class Result(NamedTuple):
     Attributes:
       evaluation: what was played.
       distance: to the expert, relative to a random policy's; None if unknown.
+      sides: of the video; empty without one.
       filmed: arrays that belong to the video, see `Evaluator.explain`.
     """
 
     evaluation: Evaluation
     distance: float | None
+    sides: list[film.Side]
     filmed: dict[str, np.ndarray]
 
 
@@ -74,36 +79,64 @@ class Evaluator:
             )[0]
 
         every = config.video_every_evals
+        films = every > 0 and (number % every == 0 or is_last)
+        first_episode = number * config.num_eval_episodes
         try:
             evaluation = evaluate(
                 self.environment,
                 act,
                 num_episodes=config.num_eval_episodes,
-                first_episode=number * config.num_eval_episodes,
-                record_video=every > 0 and (number % every == 0 or is_last),
+                first_episode=first_episode,
+                record=film.recorder(self.environment, film.SIZE) if films else None,
                 stop_asked=stop_asked,
             )
         except Stopped:
             return None
-        distance, filmed = None, {}
+        distance, sides, filmed = None, [], {}
         if self._distance is not None:
             distance = self._distance.relative_distance(evaluation.episodes)
-        if evaluation.video is not None:
+        if films:
             filmed = self.explain(state, evaluation.episodes[0])
-        return Result(evaluation, distance, filmed)
+            # One episode at 256 pixels takes as long as one or two that the agent sees.
+            sides = film.sides(
+                config,
+                self.environment,
+                evaluation,
+                first_episode=first_episode,
+                imitation_rewards=filmed["imitation_rewards"],
+            )
+        return Result(evaluation, distance, sides, filmed)
 
     def explain(self, state: TrainState, episode: Episode) -> dict[str, np.ndarray]:
         """Returns an episode's rewards and transport plan, for videos and reports.
 
         Returns:
-          `task_rewards` [T], `imitation_rewards` [T], and the transport plan
-          `plan` [T + 1, N + 1] if the method has one.
+          `task_rewards` [T], `imitation_rewards` [T]; `step_seconds`, if known; and if
+          the method has one, the transport plan `plan` [T + 1, N + 1] with evenly
+          spaced frames of both episodes, `agent_strip` and `expert_strip`
+          [10, H, W, 3], if it sees pixels.
         """
         arguments = (state.rewarder, state.params, episode, self._experts)
         found = {
             "task_rewards": episode.rewards,
             "imitation_rewards": np.asarray(self._agent.rewards(*arguments)),
         }
+        seconds = self.environment.decision_seconds
+        if seconds is not None:
+            found["step_seconds"] = np.asarray(seconds)
         if self._agent.plan is not None:
-            found["plan"] = np.asarray(self._agent.plan(*arguments))
+            assert self._experts is not None
+            plan, index = self._agent.plan(*arguments)
+            length = int(self._experts.num_frames[index])
+            expert_frames = self._experts.frames[index]
+            found["plan"] = np.asarray(plan)[:, :length]
+            if expert_frames.ndim == 4:
+                found["agent_strip"] = _strip(episode.frames)
+                found["expert_strip"] = _strip(expert_frames[:length])
         return found
+
+
+def _strip(frames: np.ndarray) -> np.ndarray:
+    """Returns evenly spaced frames of an episode, the first and the last included."""
+    times = np.linspace(0, len(frames) - 1, _STRIP_FRAMES).round().astype(int)
+    return np.asarray(frames[times])

@@ -1,17 +1,23 @@
 """One episode of a learned policy beside the expert's, large enough for people."""
 
-from typing import NamedTuple
+import contextlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
 
-from jaxil.demonstrations import playing, rendering
-from jaxil.demonstrations.loading import Demonstrations
+from jaxil import config as jaxil_config
+from jaxil.config import Config
+from jaxil.demonstrations import rendering
+from jaxil.demonstrations.states import DemonstrationError
+from jaxil.environments.evaluation import Evaluation
 from jaxil.environments.interaction import Restorable
-from jaxil.machine.progress import shown
+from jaxil.environments.pixel_environment import PixelEnvironment
+from jaxil.machine import progress, screen
 from jaxil.training import assembly
-from jaxil.training.trained import Trained
 
+SIZE = 256  # pixels of a side, unless another is asked for
 _VIEW_SHARE = 0.3  # of a side, for what the agent itself sees
 _FRAME = 1  # pixels around it
 
@@ -21,86 +27,116 @@ class Side(NamedTuple):
 
     Attributes:
       frames: uint8 [T + 1, H, W, 3].
-      captions: whose it is, time and return so far, for each frame.
+      captions: whose it is, time and rewards so far, for each frame.
     """
 
     frames: np.ndarray
     captions: list[str]
 
 
-def agent_side(run: Trained, image_size: int) -> Side:
-    """Plays an episode and renders it large, at the quality of the run.
+def recorder(environment: PixelEnvironment, image_size: int) -> Callable[[], Any]:
+    """Returns what an evaluation calls at each moment of the episode to be filmed.
 
-    What the agent sees is in the lower right corner. A task without simulator states is
-    shown as the agent sees it.
+    Simulator states are rendered later, in another simulator. A task without them is
+    rendered at once.
+    """
+    sees_pixels = len(environment.observation_spec().shape) == 3
+
+    def record() -> tuple[np.ndarray | None, Any]:
+        view = environment.frame() if sees_pixels else None
+        if isinstance(environment, Restorable):
+            return view, environment.simulator_state()
+        return view, environment.render(image_size)
+
+    return record
+
+
+def sides(
+    config: Config,
+    environment: PixelEnvironment,
+    evaluation: Evaluation,
+    *,
+    first_episode: int,
+    image_size: int = SIZE,
+    imitation_rewards: np.ndarray | None = None,
+    shows_progress: bool = False,
+) -> list[Side]:
+    """Returns the agent's episode and the expert's first one, if it can be had.
 
     Args:
-      run: the policy and its environment.
-      image_size: height and width of the rendered images.
+      config: of the run.
+      environment: what the evaluation was played in.
+      evaluation: recorded by `recorder` with the same size.
+      first_episode: number of the recorded episode.
+      image_size: height and width of the images.
+      imitation_rewards: of the recorded episode, [T]; None if unknown.
+      shows_progress: whether rendering has a progress line.
     """
-    environment, config = run.environment, run.config
-    views: list[np.ndarray] = []
-
-    def act(step: int, observation: np.ndarray) -> np.ndarray:
-        del step
-        if observation.ndim == 3:
-            views.append(observation[..., -3:])  # the newest of the stack
-        return run.act(observation)
-
+    views, moments = zip(*evaluation.recorded)
+    seconds = environment.decision_seconds
     if not isinstance(environment, Restorable):
-        episodes = playing.play_pixels(environment, lambda _: act, 1, lambda *_: None)
-        (episode,) = episodes
-        frames, rewards = np.asarray(episode.frames), episode.rewards
+        frames = np.stack(moments)
     else:
-        played = playing.play(environment, lambda _: act, 1)
-        with shown("rendering the agent's episode") as show:
+        with _shown("the agent's episode", shows_progress) as show:
             (frames,) = rendering.observe_episodes(
-                {name: played[name] for name in ("qpos", "qvel", "act")},
+                {k: np.stack([m[k] for m in moments])[None] for k in moments[0]},
                 task=config.task,
                 seed=config.seed + assembly.EVALUATION_SEED,
-                first_episode=0,
+                first_episode=first_episode,
                 image_size=image_size,
                 render_quality=config.render_quality,
                 camera=config.camera,
                 cache=False,
                 progress=show,
             )
-        (rewards,) = played["rewards"]
-        if views:
-            _inset(frames, views)
-    return Side(frames, _captions("agent", len(frames), rewards, _seconds(run)))
-
-
-def expert_side(run: Trained, expert: Demonstrations) -> Side:
-    """Returns the first demonstration, as `assembly.load_shown_expert` loads it."""
-    length = expert.num_frames[0]
+    if views[0] is not None:
+        _inset(frames, views)
+    rewards = evaluation.episodes[0].rewards
+    captions = _captions("agent", len(frames), seconds, rewards, imitation_rewards)
+    found = [Side(frames, captions)]
+    if not jaxil_config.uses_demonstrations(config):
+        return found
+    try:
+        with _shown("the expert's episode, once", shows_progress) as show:
+            expert = assembly.load_shown_expert(config, image_size, show)
+    except DemonstrationError as error:
+        screen.say(f"the video is without the expert: {error}")
+        return found
+    frames = expert.frames[0, : expert.num_frames[0]]
     rewards = None if expert.task_rewards is None else expert.task_rewards[0]
-    return Side(
-        expert.frames[0, :length], _captions("expert", length, rewards, _seconds(run))
-    )
+    found.append(Side(frames, _captions("expert", len(frames), seconds, rewards)))
+    return found
 
 
-def _seconds(run: Trained) -> float | None:
-    return run.environment.decision_seconds
+def _shown(what: str, shows_progress: bool) -> Any:
+    if shows_progress:
+        return progress.shown(f"rendering {what}")
+    return contextlib.nullcontext()
 
 
 def _captions(
-    name: str, count: int, rewards: np.ndarray | None, step_seconds: float | None
+    name: str,
+    count: int,
+    step_seconds: float | None,
+    rewards: np.ndarray | None,
+    imitation_rewards: np.ndarray | None = None,
 ) -> list[str]:
     texts = [name] * count
     if step_seconds is not None:
-        texts = [f"{t}   {k * step_seconds:.1f} s" for k, t in enumerate(texts)]
+        texts = [f"{t}  {k * step_seconds:.1f} s" for k, t in enumerate(texts)]
     if rewards is not None:
         so_far = np.concatenate([[0.0], np.cumsum(rewards)])[:count]
-        texts = [f"{t}   return {r:.0f}" for t, r in zip(texts, so_far)]
+        texts = [f"{t}  return {r:.0f}" for t, r in zip(texts, so_far)]
+    if imitation_rewards is not None:
+        newest = np.concatenate([[0.0], imitation_rewards])[:count]
+        texts = [f"{t}  reward {r:.3g}" for t, r in zip(texts, newest)]
     return texts
 
 
-def _inset(frames: np.ndarray, views: list[np.ndarray]) -> None:
-    """Draws what the agent sees into the corner of each frame."""
+def _inset(frames: np.ndarray, views: tuple[np.ndarray, ...]) -> None:
+    """Puts what the agent sees into the corner of each frame."""
     side = round(_VIEW_SHARE * frames.shape[1])
-    for index, frame in enumerate(frames):
-        view = Image.fromarray(views[min(index, len(views) - 1)])
-        small = np.asarray(view.resize((side, side), Image.Resampling.NEAREST))
+    for frame, view in zip(frames, views, strict=True):
+        resized = Image.fromarray(view).resize((side, side), Image.Resampling.NEAREST)
         frame[-side - _FRAME :, -side - _FRAME :] = 255
-        frame[-side:, -side:] = small
+        frame[-side:, -side:] = np.asarray(resized)

@@ -4,7 +4,7 @@ import io
 import math
 import pathlib
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from jaxil.files import video
 from jaxil.files.tables import CsvLog
 from jaxil.files.writing import write_atomically
 from jaxil.machine.screen import say
-from jaxil.training import learning_curve
+from jaxil.training import film, learning_curve
 from jaxil.training.workdir import writes_to
 
 TRAIN_COLUMNS = (
@@ -92,12 +92,9 @@ class Outputs:
                 )
             )
             self._events = _Events(workdir / "tensorboard", resume_frame)
-        self._expert_frames: np.ndarray | None = None
         self._expert_return: float | None = None
         if demonstrations is not None:
             self._expert_return = demonstrations.mean_return()
-            if demonstrations.frames.ndim == 5:
-                self._expert_frames = demonstrations.frames[0]
         self._last = (0, 0.0)  # frame and seconds of the last row
 
     def episode(
@@ -143,7 +140,8 @@ class Outputs:
         *,
         pre_tanh: float,
         distance: float | None,
-        filmed: dict[str, np.ndarray],
+        sides: Sequence[film.Side],
+        filmed: Mapping[str, np.ndarray],
     ) -> str:
         """Logs an evaluation, with learning curve and video.
 
@@ -154,6 +152,7 @@ class Outputs:
           episode: training episodes so far.
           pre_tanh: the actor's mean |pre-tanh|; NaN before the first update.
           distance: to the expert, relative to a random policy; None if unknown.
+          sides: of the video; empty without one.
           filmed: arrays to keep beside the video, see `Evaluator.explain`.
 
         Returns:
@@ -181,8 +180,8 @@ class Outputs:
                 title=f"{config.method} on {config.task}, seed {config.seed}",
                 expert_return=self._expert_return,
             )
-            if evaluation.video is not None:
-                self._write_video(evaluation.video, filmed, frame)
+            if sides:
+                self._write_video(sides, filmed, frame)
         line = (
             f"frame {frame}: task return {evaluation.mean:.1f} ± {evaluation.std:.1f}"
         )
@@ -210,18 +209,22 @@ class Outputs:
             self._events.write("train", row)
 
     def _write_video(
-        self, agent_frames: np.ndarray, filmed: dict[str, np.ndarray], frame: int
+        self,
+        sides: Sequence[film.Side],
+        filmed: Mapping[str, np.ndarray],
+        frame: int,
     ) -> None:
         folder = self._workdir / "videos"
         folder.mkdir(exist_ok=True)
         packed = io.BytesIO()
         np.savez_compressed(packed, **filmed)  # pyright: ignore[reportArgumentType]
         write_atomically(folder / f"frame_{frame:09d}.npz", packed.getvalue())
+        frames, captions = zip(*sides)
         video.write_video(
             folder / f"frame_{frame:09d}.mp4",
-            agent_frames,
-            self._expert_frames,
-            fps=frames_per_second(len(agent_frames)),
+            *frames,
+            fps=frames_per_second(len(frames[0])),
+            labels=captions,
         )
 
 

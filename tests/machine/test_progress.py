@@ -33,8 +33,22 @@ def test_the_line_by_hand():
     # 1000 frames in 10 s; 2, 7.5 and 0.5 s of the 10; 9000 frames left at 100 a second.
     assert stream.getvalue() == (
         "1000/10000 frames (10.0 %) | 100 frames/s"
-        " | environment 20% update 75% rest 5% | return task 12.3 | 2 min left\n"
+        " | environment 20% update 75% rest 5% | return task 12.3 ▁ | 2 min left\n"
     )
+
+
+def test_returns_are_a_curve_from_the_first_episode_on():
+    stream = io.StringIO()
+    line, clock = make_line(stream)
+    for episode in range(32):  # all but the last between two lines
+        returns = {"task": 10.0 * episode, "imitation": -1.0}
+        clock.seconds = episode / 16 + (episode == 31)
+        line.update(100 * episode, {}, returns)
+        line.update(100 * episode + 50, {}, returns)  # the same episode still
+    clock.seconds = 40.0
+    line.update(3200, {}, returns)
+    # Sixteen letters, each of two episodes; eight heights.
+    assert "return task 310.0 imitation -1.0 ▁▁▂▂▃▃▄▄▅▅▆▆▇▇██ |" in stream.getvalue()
 
 
 def test_a_terminal_has_one_live_line_and_messages_above(monkeypatch):

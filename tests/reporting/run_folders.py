@@ -82,7 +82,10 @@ def film(folder: pathlib.Path, frame: int, *, plan: bool) -> None:
         "task_rewards": np.linspace(0, 1, 29, dtype=np.float32),
     }
     if plan:
+        # Two columns of padding, as runs of before wrote them.
         arrays["plan"] = np.eye(30, 28, dtype=np.float32) / 30
+        arrays["step_seconds"] = np.asarray(0.1)
+        arrays["agent_strip"] = arrays["expert_strip"] = frames[::3]
     np.savez_compressed(path.with_suffix(".npz"), **arrays)
 
 

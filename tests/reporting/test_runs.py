@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 
-from jaxil.reporting import groups, remarks, runs, tables
+from jaxil.reporting import groups, measures, remarks, runs, tables
 from tests.reporting.run_folders import EVAL_HEADER, many_runs, write_run
 
 
@@ -201,6 +201,36 @@ def test_several_settings_get_a_letter_and_a_row_that_explains_it(found):
     read = [run for run in found.values() if not isinstance(run, str)]
     (row,) = tables.settings_table(groups.make_groups(read)).rows
     assert row == {"variant": "P-DAC (A)", "settings": "action_repeat 4, batch_size 64"}
+
+
+def test_a_label_means_the_same_on_every_task(tmp_path):
+    read = []
+    for task, changes in (
+        ("walker_walk", {}),
+        ("hopper_hop", {"action_repeat": 4}),
+        ("hopper_hop", {"action_repeat": 4, "shift_padding": 0}),
+        ("walker_walk", {"shift_padding": 0}),
+    ):
+        folder = tmp_path / str(len(read))
+        write_run(folder, "pdac", task, 0, {1000: 1}, changes=changes)
+        read.append(runs.read(folder))
+    assert {(group.task, group.label) for group in groups.make_groups(read)} == {
+        ("walker_walk", "P-DAC"),
+        ("hopper_hop", "P-DAC (action_repeat 4)"),
+        ("hopper_hop", "P-DAC, no augmentation (A)"),  # four words beyond "P-DAC"
+        ("walker_walk", "P-DAC, no augmentation"),
+    }
+
+
+def test_a_return_is_a_share_of_its_own_experts(tmp_path):
+    for seed, expert in enumerate((1000.0, 500.0)):
+        folder = tmp_path / str(seed)
+        write_run(folder, "pdac", "walker_walk", seed, {1000: 500}, expert=expert)
+    (group,) = groups.make_groups(map(runs.read, runs.find([tmp_path])))
+    final = measures.final(group)
+    assert final is not None
+    (row,) = tables.final_table([final]).rows
+    assert row["share_of_expert"] == 0.75  # 500 of 1000, and 500 of 500
 
 
 def test_a_run_whose_method_is_not_installed_is_shown(tmp_path):

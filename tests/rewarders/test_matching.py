@@ -51,14 +51,16 @@ def test_the_closest_demonstration_counts(alignment):
     chosen = matching("euclidean", alignment)
     rewards = chosen.rewards(near, experts, jnp.array([6, 6]))
     assert float(jnp.sum(rewards)) > -0.02
-    plan = chosen.closest_plan(near, experts, jnp.array([6, 6]))
+    plan, closest = chosen.closest_plan(near, experts, jnp.array([6, 6]))
+    assert int(closest) == 1
     np.testing.assert_allclose(plan, np.eye(6) / 6, atol=1e-3)
 
 
 @pytest.mark.parametrize("alignment", ["time", "transport"])
 def test_rows_carry_their_share_and_padding_carries_nothing(alignment):
     agent, experts = random(0, 5, 3), random(1, 2, 7, 3)
-    plan = matching("cosine", alignment).closest_plan(agent, experts, jnp.array([4, 4]))
+    moments = jnp.array([4, 4])
+    plan, _ = matching("cosine", alignment).closest_plan(agent, experts, moments)
     np.testing.assert_allclose(jnp.sum(plan, axis=1), np.full(5, 0.2), rtol=1e-5)
     assert float(jnp.max(plan[:, 4:])) < 1e-6
 

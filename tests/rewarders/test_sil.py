@@ -119,6 +119,7 @@ def test_the_first_episode_returns_minus_ten_and_the_scale_stays():
 def test_the_plan_matches_a_demonstration_with_itself():
     make_plan = make_rewarder().plan
     assert make_plan is not None
-    plan = make_plan(start(), NOBODY, make_episode(EXPERTS.frames[1]), EXPERTS)
+    plan, closest = make_plan(start(), NOBODY, make_episode(EXPERTS.frames[1]), EXPERTS)
+    assert int(closest) == 1
     assert plan.shape == (STEPS + 1, STEPS + 1)
     assert np.all(np.argmax(plan, axis=1) == np.arange(STEPS + 1))

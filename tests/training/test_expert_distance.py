@@ -88,7 +88,7 @@ def test_a_stored_distance_is_used_if_it_verifies(tmp_path, monkeypatch):
 
     def play(*_, **__):
         played.append(None)
-        return Evaluation([episode(draw(5, 9))], np.array([3.0]), None)
+        return Evaluation([episode(draw(5, 9))], np.array([3.0]), [])
 
     monkeypatch.setattr(expert_distance, "evaluate", play)
     environment = types.SimpleNamespace(

@@ -45,9 +45,9 @@ def write_episode(outputs, frame=1000):
 
 
 def write_evaluation(outputs, frame=1000):
-    evaluation = Evaluation([], np.array([10.0, 30.0]), None)
+    evaluation = Evaluation([], np.array([10.0, 30.0]), [])
     return outputs.evaluation(
-        evaluation, frame, 20.0, 1, pre_tanh=4.0, distance=0.5, filmed={}
+        evaluation, frame, 20.0, 1, pre_tanh=4.0, distance=0.5, sides=[], filmed={}
     )
 
 
