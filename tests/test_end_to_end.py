@@ -197,19 +197,6 @@ def _exported(folder, observations):
     return np.load(folder / "actions.npy")
 
 
-def test_ctrl_c_saves_and_says_how_to_resume(tmp_path):
-    flags = (*small_run("zero", tmp_path), *STATES, "--config.total_frames=1000000")
-    process = _start(*flags)
-    rows = tmp_path / "train.csv"
-    _wait_for(lambda: rows.exists() and rows.read_text().count("\n") > 2, process)
-    process.send_signal(signal.SIGINT)
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 130
-    assert "rerun the same command to resume" in output
-    assert "Traceback" not in output
-    assert list((tmp_path / "checkpoints").glob("frame_*"))
-
-
 def test_a_run_outlives_the_pipe_that_it_writes_to(tmp_path):
     # As in `... 2>&1 | head -1`.
     flags = (*small_run("zero", tmp_path), *STATES, "--config.total_frames=2000")

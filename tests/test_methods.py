@@ -126,25 +126,6 @@ def package(tmp_path, monkeypatch) -> pathlib.Path:
     return folder
 
 
-def test_a_method_from_outside_trains(package, tmp_path):
-    del package
-    workdir = tmp_path / "run"
-    finished = run(
-        "launch",
-        *small_run("zero", workdir),
-        "--config.method=my_method:METHOD",
-        "--config.brightness.weight=0.5",
-        "--config.total_frames=1000",
-    )
-    assert finished.returncode == 0, finished.stderr
-    header, first, *_ = (workdir / "train.csv").read_text().splitlines()
-    row = dict(zip(header.split(","), first.split(",")))
-    assert float(row["brightness/weight"]) == 0.5
-    # 100 agent steps of pictures that are neither black nor white.
-    assert 0.0 < float(row["imitation_return"]) < 50.0
-    assert list(workdir.glob("checkpoints/frame_*"))
-
-
 def test_its_own_fields_are_checked_like_any_other(package, tmp_path):
     del package
     finished = run(
