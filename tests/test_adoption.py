@@ -1,7 +1,7 @@
 """From a wheel to a report, as somebody does who has never seen the repository.
 
-The environment holds the wheel alone; what jaxil depends on comes from this one, whose
-installation takes minutes.
+The new environment holds the wheel alone; what jaxil depends on comes from this one,
+since its installation takes minutes.
 """
 
 import os
@@ -85,6 +85,7 @@ _PENDULUM = (
 @pytest.fixture(name="home")
 def _home(tmp_path, monkeypatch) -> pathlib.Path:
     """A user's home, where `jaxil` is the wheel's and the checkout is out of sight."""
+    monkeypatch.delenv("PYTHONPATH", raising=False)
     source, environment, home = (tmp_path / name for name in ("source", "env", "home"))
     for folder in (source, home):
         folder.mkdir()
@@ -93,24 +94,24 @@ def _home(tmp_path, monkeypatch) -> pathlib.Path:
     shutil.copytree(
         ROOT / "jaxil", source / "jaxil", ignore=shutil.ignore_patterns("*.pyc")
     )
-    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "-q")
-    options = ("--no-deps", "--no-build-isolation", "--no-index", "-w", str(tmp_path))
-    subprocess.run([*pip, "wheel", *options, str(source)], check=True, timeout=300)
-    (wheel,) = tmp_path.glob("*.whl")
-    shutil.rmtree(source)
+    build = "from setuptools.build_meta import build_wheel; build_wheel('.')"
+    subprocess.run([sys.executable, "-c", build], check=True, cwd=source, timeout=300)
     venv.create(environment, with_pip=False)
     python = str(environment / "bin" / "python")
-    install = ("--python", python, "install", "--no-deps", "--no-index", str(wheel))
-    subprocess.run([*pip, *install], check=True, timeout=300)
-    # A folder on the path: .pth files in it, such as the checkout's, have no effect.
+    pip = (sys.executable, "-m", "pip", "--python", python, "install", "-q")
+    wheels = map(str, source.glob("*.whl"))
+    words = (*pip, "--no-deps", "--no-index", *wheels)
+    subprocess.run(words, check=True, cwd=home, timeout=300)
     (packages,) = environment.glob("lib/python*/site-packages")
+    # A folder on the path: .pth files in it, such as the checkout's, have no effect.
     (packages / "others.pth").write_text(f"{sysconfig.get_path('purelib')}\n")
+    shutil.rmtree(source)
+    assert _files(packages) == _files(ROOT)
     monkeypatch.setenv("PATH", str(environment / "bin"), prepend=os.pathsep)
     # Programs that jax, GL and Matplotlib have prepared before stay in reach.
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache_folder().parent))
     monkeypatch.setenv("HOME", str(home))
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
-    monkeypatch.delenv("PYTHONPATH", raising=False)
     monkeypatch.chdir(home)
     where = run("python", "-c", "import jaxil; print(jaxil.__file__)")
     assert pathlib.Path(where.strip()).is_relative_to(packages)
@@ -153,19 +154,23 @@ def test_a_wheel_is_enough(home, monkeypatch):
     assert read_csv(folder / "train.csv")["frame"].tolist() == [1000, 2000]
 
     assert "the expert's mean" in run(
-        "jaxil", "evaluate", "--workdir=~/runs/x", "--num_episodes=1"
+        "jaxil",
+        "evaluate",
+        "--workdir=~/runs/x",
+        "--num_episodes=1",
+        "--video_size=64",
+        "--gif",
     )
-    (film,) = (folder / "videos").glob("evaluation_*.mp4")
-    assert film.stat().st_size > 1_000
+    for suffix in ("mp4", "gif"):
+        (film,) = (folder / "videos").glob(f"evaluation_*.{suffix}")
+        assert film.stat().st_size > 1_000
 
     # README's lines on the policy, and a video of one's own.
     assert _POLICY is not None
     (home / "runs" / "quickstart").symlink_to(folder)
-    (home / "policy.py").write_text(f"{_POLICY[1]}\nprint(type(timestep))\n")
-    assert "TimeStep" in run("python", "policy.py")
+    (home / "script.py").write_text(f"{_POLICY[1]}\nprint(timestep.last()){_RECORD}")
+    assert "True" in run("python", "script.py")
     (home / "runs" / "quickstart").unlink()
-    (home / "record.py").write_text(_RECORD)
-    run("python", "record.py")
 
     (home / "my_method.py").write_text(_METHOD)
     monkeypatch.setenv("PYTHONPATH", str(home))
@@ -188,6 +193,11 @@ def test_a_wheel_is_enough(home, monkeypatch):
     page = (home / "report" / "index.html").read_text()
     for words in ("P-DAC", "cartpole_swingup", "Brightness", _TASK):
         assert words in page
+
+
+def _files(root: pathlib.Path) -> set[pathlib.Path]:
+    found = {path for path in (root / "jaxil").rglob("*") if path.is_file()}
+    return {path.relative_to(root) for path in found if path.suffix != ".pyc"}
 
 
 def _rows(folder: pathlib.Path) -> int:
