@@ -144,6 +144,9 @@ FIELDS: dict[str, Field] = {
         10_000, "what a killed run loses at most", 1, 10**10
     ),
     "video_every_evals": Field(5, "0 turns videos off", 0, 10**6),
+    "logger": Field(
+        "", "beside the tables and TensorBoard: wandb, or package.module:function"
+    ),
 }
 # Fields that change what is kept or shown, or how fast it comes, and nothing that is
 # learned: runs that differ in no other are seeds of one thing, and may be resumed.
@@ -155,6 +158,7 @@ FREE_FIELDS = (
     "num_eval_episodes",
     "checkpoint_every_frames",
     "video_every_evals",
+    "logger",
 )
 # Fields that must end with a decision.
 _WHOLE_DECISIONS = (

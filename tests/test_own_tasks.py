@@ -66,6 +66,45 @@ def centre(image):
 
 def lean(state):  # lets the pole fall: episodes of some thirty steps
     return np.clip([0.05 * state[1]], -1.0, 1.0)
+
+
+def hinge():
+    from dm_control import composer, mjcf
+    from dm_control.composer.observation import observable
+
+    class Arm(composer.Entity):
+        def _build(self):
+            self.model = mjcf.RootElement("arm")
+            body = self.model.worldbody.add("body")
+            self.joint = body.add("joint", type="hinge", axis=(0, 1, 0))
+            size, colour = (0.05, 0.3), (1, 0, 0, 1)
+            body.add("geom", type="capsule", size=size, rgba=colour)
+            self.model.actuator.add("motor", joint=self.joint, ctrlrange=(-2, 2))
+            settings = {"pos": (0, -2, 0), "xyaxes": (1, 0, 0, 0, 0, 1)}
+            self.model.worldbody.add("camera", name="side", **settings)
+
+        mjcf_model = property(lambda self: self.model)
+
+    class Swing(composer.Task):
+        def __init__(self):
+            self.arm = Arm()
+            self.set_timesteps(0.02, 0.01)
+
+        root_entity = property(lambda self: self.arm)
+
+        @property
+        def task_observables(self):
+            angle = observable.MJCFFeature("qpos", self.arm.joint)
+            angle.enabled = True
+            return {"angle": angle}
+
+        def initialize_episode(self, physics, random_state):
+            physics.bind(self.arm.joint).qpos = random_state.uniform(-2, 2)
+
+        def get_reward(self, physics):
+            return np.cos(physics.bind(self.arm.joint).qpos).item()
+
+    return composer.Environment(Swing(), time_limit=0.2)
 """
 _SIZES = (
     "--config.action_repeat=2",
@@ -97,30 +136,23 @@ def rows(path):
         ("light:make", "light:centre"),
     ],
 )
-def test_a_task_from_outside_is_recorded_trained_resumed_and_shown(
-    task, policy, tmp_path, capsys
-):
-    expert, workdir = tmp_path / "expert.npz", tmp_path / "runs" / "1"
-    collect.main(
-        [
-            "collect",
-            f"--policy={policy}",
-            f"--task={task}",
-            f"--output={expert}",
-            "--num_episodes=2",
-            "--image_size=24",
-        ]
-    )
+def test_a_function_plays_and_is_recorded(task, policy, tmp_path, capsys):
+    record(task, policy, tmp_path / "expert.npz")
     assert "2 episodes" in capsys.readouterr().out
-    recording = foreign.open_recording(expert, max_bytes=2**24)
+    recording = foreign.open_recording(tmp_path / "expert.npz", max_bytes=2**24)
     assert (recording.task, recording.action_repeat) == (task, 2)
     episode = next(recording.episodes)
     assert episode.frames.shape[1:] == (24, 24, 3)
     assert episode.frames.std() > 0
     assert episode.actions is not None
 
+
+# tests/test_adoption.py does the same with a task of Gymnasium.
+def test_a_task_from_outside_is_trained_resumed_and_shown(tmp_path):
+    expert, workdir = tmp_path / "expert.npz", tmp_path / "runs" / "1"
+    record("light:make", "light:centre", expert)
     flags = (
-        f"--config=configs/tiny.py:zero,{task}",
+        "--config=configs/tiny.py:zero,light:make",
         f"--workdir={workdir}",
         *small("zero"),
         *_SIZES,
@@ -136,20 +168,30 @@ def test_a_task_from_outside_is_recorded_trained_resumed_and_shown(
     assert list((workdir / "videos").glob("frame_*.mp4"))
     assert float(rows(workdir / "eval.csv")[-1]["expert_task_return_mean"]) > 0
 
-    evaluate = ("evaluate", f"--workdir={workdir}", "--num_episodes=1")
-    if not task.startswith("gymnasium"):
-        # In a process of its own, which the user has told nothing: the folder alone
-        # may not make Python import anything.
-        refused = run(*evaluate)
-        assert refused.returncode == 2
-        assert f"--trust={task}" in refused.stderr
-        evaluate += (f"--trust={task}",)
-    evaluated = call(*evaluate)
+    # The folder alone may not make Python import anything.
+    words = (f"--workdir={workdir}", "--num_episodes=1")
+    refused = run("evaluate", *words)
+    assert refused.returncode == 2
+    assert "--trust=light:make" in refused.stderr
+    evaluated = call("evaluate", *words, "--trust=light:make")
     assert evaluated.returncode == 0, evaluated.stderr
     assert "the expert's mean" in evaluated.stdout
     reported = call("report", str(workdir.parent), f"--output={tmp_path / 'report'}")
     assert reported.returncode == 0, reported.stderr
-    assert task in (tmp_path / "report" / "index.html").read_text()
+    assert "light:make" in (tmp_path / "report" / "index.html").read_text()
+
+
+def record(task, policy, path):
+    collect.main(
+        [
+            "collect",
+            f"--policy={policy}",
+            f"--task={task}",
+            f"--output={path}",
+            "--num_episodes=2",
+            "--image_size=24",
+        ]
+    )
 
 
 def test_faults_of_tasks_are_one_message_each(tmp_path):
@@ -205,6 +247,24 @@ def test_pixels_are_scaled_and_starts_depend_on_seed_and_number_alone():
     assert starts[0].shape == (16, 16, 9)
     np.testing.assert_array_equal(starts[0], starts[2])
     assert not np.array_equal(starts[0], starts[1])
+
+
+def test_a_task_of_composer_is_seeded_rendered_and_cut_off():
+    from jaxil.environments import tasks
+
+    assert _problems("light:hinge", camera="side") == []
+    assert "0 side" in _problems("light:hinge", camera="front")[0]
+    assert "suite" in _problems("light:hinge", distraction="easy")[0]
+    environment = tasks.make_environment("light:hinge", seed=3, image_size=16)
+    assert environment.episode_steps == 5
+    starts = [environment.reset(episode=episode).observation for episode in (5, 6, 5)]
+    np.testing.assert_array_equal(starts[0], starts[2])
+    assert not np.array_equal(starts[0], starts[1])
+    steps = [environment.step(np.ones(1)) for _ in range(5)]
+    assert [step.last() for step in steps] == [False] * 4 + [True]
+    assert steps[-1].discount == 1.0
+    assert not np.array_equal(steps[-1].observation, starts[2])
+    environment.close()
 
 
 def test_environments_of_one_process_render_what_they_would_alone():

@@ -1,6 +1,5 @@
 """launch/setup.sh, with an interpreter that only notes what it is asked to do."""
 
-import configparser
 import os
 import pathlib
 import shutil
@@ -114,15 +113,3 @@ def test_other_pythons_are_refused(project):
     status, printed, found = run(project, VERSION="3.13")
     assert (status, found) == (2, [])
     assert "PYTHON=PATH" in printed
-
-
-def test_a_wheel_holds_every_file_of_the_package():
-    settings = configparser.ConfigParser()
-    settings.read(ROOT / "setup.cfg")
-    patterns = settings["options.package_data"]["jaxil"].replace("\n", "").split(",")
-    package = ROOT / "jaxil"
-    held = {p for each in patterns for p in package.glob(each.strip())}
-    files = {p for p in package.rglob("*") if p.is_file() and p.suffix != ".pyc"}
-    assert {p for p in files if p.suffix != ".py"} <= held
-    folders = {path.parent for path in files if path.suffix == ".py"}
-    assert all((folder / "__init__.py").is_file() for folder in folders)

@@ -9,8 +9,10 @@ import pytest
 
 from jaxil import config as jaxil_config
 from jaxil import train
+from jaxil.environments.evaluation import Evaluation
 from jaxil.environments.player import Player
 from jaxil.environments.pool import EnvironmentsFailed
+from jaxil.training.evaluator import Result
 from jaxil.training.parts import Counters
 from jaxil.training.stopwatch import Stopwatch
 from tests.environments.counting import Counting, InTurn
@@ -122,7 +124,12 @@ class Dummies:
             self.tape.append("evaluation stopped")
             return None
         self.tape.append("last evaluation" if is_last else "evaluate")
-        return types.SimpleNamespace(evaluation=None, distance=None, filmed={})
+        return Result(
+            evaluation=Evaluation([], np.zeros(0), []),
+            distance=None,
+            sides=[],
+            filmed={},
+        )
 
     def loop(self, **kwargs):
         self.run.loop(**kwargs)

@@ -4,11 +4,13 @@
     gymnasium:ID               of Gymnasium, with continuous actions
     package.module:function    of the user: returns a dm_env.Environment
 
-Environments of the user that dm_control made can do whatever the suite's can.
+Environments of the user that are built as the suite's are can do whatever those can;
+of dm_control's others, such as composer's, the camera can be chosen.
 """
 
 import atexit
 import functools
+import math
 from typing import Any
 
 import dm_env
@@ -91,10 +93,15 @@ def make_environment(
     own_task = getattr(simulator, "task", None)
     if isinstance(getattr(own_task, "random", None), np.random.RandomState):
         return suite.wrap(simulator, **settings)
+    if hasattr(simulator, "physics") and not hasattr(simulator, "render"):
+        simulator = _DmControl(simulator, settings["camera"], image_size)
+        settings["camera"] = ""
     for name in _OF_DM_CONTROL:
         value = settings.pop(name)
         if name != "render_quality" and value != _DEFAULTS[name]:
-            raise UsageError(Fault(name, "is for tasks of dm_control", value=value))
+            raise UsageError(
+                Fault(name, "is for tasks of dm_control's suite", value=value)
+            )
     return PixelEnvironment(simulator, **settings)
 
 
@@ -106,6 +113,36 @@ def timing(task: str, action_repeat: int) -> tuple[float | None, int | None]:
     found = environment.decision_seconds, environment.episode_steps
     environment.close()
     return found
+
+
+class _DmControl:
+    """An environment of dm_control that is not built as the suite's: composer's, say.
+
+    It can be seeded if it has a `random_state`.
+    """
+
+    def __init__(self, inner: Any, camera: str, image_size: int) -> None:
+        self._inner, self._size = inner, image_size
+        model = inner.physics.model
+        # Without cameras, MuJoCo's free one.
+        self._camera = suite.camera_index(model, camera, 0 if model.ncam else -1)
+        self.frame_seconds = inner.control_timestep()
+        seconds = getattr(inner, "_time_limit", math.inf)
+        frames = getattr(inner, "_step_limit", seconds / self.frame_seconds)
+        self.step_limit = math.inf if math.isinf(frames) else math.ceil(frames - 1e-6)
+        self.reset, self.step, self.close = inner.reset, inner.step, inner.close
+        self.action_spec = inner.action_spec
+        self.observation_spec = inner.observation_spec
+
+    def seed(self, number: int) -> None:
+        """Determines the next reset."""
+        if hasattr(self._inner, "random_state"):
+            self._inner.random_state.seed(number)
+
+    def render(self) -> np.ndarray:
+        """Returns the current image."""
+        size, camera = self._size, self._camera
+        return self._inner.physics.render(size, size, camera_id=camera)
 
 
 class _Gymnasium(dm_env.Environment):

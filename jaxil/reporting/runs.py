@@ -16,7 +16,7 @@ from jaxil.files.settings import as_stored, flat
 from jaxil.reporting import figures
 
 # Large folders of a run, in which there are no other runs.
-_OWN_FOLDERS = ("checkpoints", "replay", "tensorboard", "videos")
+_OWN_FOLDERS = ("checkpoints", "replay", "tensorboard", "videos", "wandb")
 _RETURN = "task_return_mean"
 _FAILED = "failed.json"  # of `jaxil sweep`
 # What every run writes; without it a file is damaged.

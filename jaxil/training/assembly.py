@@ -22,6 +22,7 @@ from jaxil.machine import memory
 from jaxil.machine.progress import shown
 from jaxil.native import build
 from jaxil.replay.replay import Replay
+from jaxil.training import loggers
 from jaxil.training.agent import native_fault, stack_size
 
 # Added to the seed for what must not share its random starts with training.
@@ -43,6 +44,7 @@ def problems(config: Config) -> list[Fault]:
     Reads the demonstration file, but renders nothing.
     """
     faults = jaxil_config.problems(config, known_tasks())
+    faults += loggers.problems(config.logger)
     bad = {fault.subject.partition(".")[0] for fault in faults}
     if not bad & {"task", *_environment_settings(config)}:
         found = tasks.problems(config.task, **_environment_settings(config))

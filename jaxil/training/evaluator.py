@@ -90,21 +90,22 @@ class Evaluator:
                 record=film.recorder(self.environment, film.SIZE) if films else None,
                 stop_asked=stop_asked,
             )
+            distance, sides, filmed = None, [], {}
+            if self._distance is not None:
+                distance = self._distance.relative_distance(evaluation.episodes)
+            if films:
+                filmed = self.explain(state, evaluation.episodes[0])
+                # 256 pixels take as long as one or two episodes that the agent sees.
+                sides = film.sides(
+                    config,
+                    self.environment,
+                    evaluation,
+                    first_episode=first_episode,
+                    imitation_rewards=filmed["imitation_rewards"],
+                    stop_asked=stop_asked,
+                )
         except Stopped:
             return None
-        distance, sides, filmed = None, [], {}
-        if self._distance is not None:
-            distance = self._distance.relative_distance(evaluation.episodes)
-        if films:
-            filmed = self.explain(state, evaluation.episodes[0])
-            # One episode at 256 pixels takes as long as one or two that the agent sees.
-            sides = film.sides(
-                config,
-                self.environment,
-                evaluation,
-                first_episode=first_episode,
-                imitation_rewards=filmed["imitation_rewards"],
-            )
         return Result(evaluation, distance, sides, filmed)
 
     def explain(self, state: TrainState, episode: Episode) -> dict[str, np.ndarray]:

@@ -1,7 +1,7 @@
 """One episode of a learned policy beside the expert's, large enough for people."""
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ from jaxil import config as jaxil_config
 from jaxil.config import Config
 from jaxil.demonstrations import rendering
 from jaxil.demonstrations.states import DemonstrationError
-from jaxil.environments.evaluation import Evaluation
+from jaxil.environments.evaluation import Evaluation, Stopped
 from jaxil.environments.interaction import Restorable
 from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.machine import progress, screen
@@ -60,6 +60,7 @@ def sides(
     image_size: int = SIZE,
     imitation_rewards: np.ndarray | None = None,
     shows_progress: bool = False,
+    stop_asked: Callable[[], bool] = lambda: False,
 ) -> list[Side]:
     """Returns the agent's episode and the expert's first one, if it can be had.
 
@@ -71,13 +72,17 @@ def sides(
       image_size: height and width of the images.
       imitation_rewards: of the recorded episode, [T]; None if unknown.
       shows_progress: whether rendering has a progress line.
+      stop_asked: asked between images, which may take half a minute in all in software.
+
+    Raises:
+      Stopped: a stop was asked for.
     """
     views, moments = zip(*evaluation.recorded)
     seconds = environment.decision_seconds
     if not isinstance(environment, Restorable):
         frames = np.stack(moments)
     else:
-        with _shown("the agent's episode", shows_progress) as show:
+        with _shown("the agent's episode", shows_progress, stop_asked) as show:
             (frames,) = rendering.observe_episodes(
                 {k: np.stack([m[k] for m in moments])[None] for k in moments[0]},
                 task=config.task,
@@ -97,7 +102,7 @@ def sides(
     if not jaxil_config.uses_demonstrations(config):
         return found
     try:
-        with _shown("the expert's episode, once", shows_progress) as show:
+        with _shown("the expert's episode, once", shows_progress, stop_asked) as show:
             expert = assembly.load_shown_expert(config, image_size, show)
     except DemonstrationError as error:
         screen.say(f"the video is without the expert: {error}")
@@ -108,10 +113,21 @@ def sides(
     return found
 
 
-def _shown(what: str, shows_progress: bool) -> Any:
-    if shows_progress:
-        return progress.shown(f"rendering {what}")
-    return contextlib.nullcontext()
+@contextlib.contextmanager
+def _shown(
+    what: str, shows_progress: bool, stop_asked: Callable[[], bool]
+) -> Iterator[Callable[[int, int], None]]:
+    """Yields a function (images done, all images) that raises Stopped if asked to."""
+    line = progress.shown(f"rendering {what}") if shows_progress else None
+    with line or contextlib.nullcontext() as show:
+
+        def step(done: int, total: int) -> None:
+            if stop_asked():
+                raise Stopped
+            if show is not None:
+                show(done, total)
+
+        yield step
 
 
 def _captions(

@@ -1,9 +1,7 @@
 """What a run writes for its user: tables, events, learning curve, videos."""
 
 import io
-import math
 import pathlib
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,7 +15,7 @@ from jaxil.files import video
 from jaxil.files.tables import CsvLog
 from jaxil.files.writing import write_atomically
 from jaxil.machine.screen import say
-from jaxil.training import film, learning_curve
+from jaxil.training import film, learning_curve, loggers
 from jaxil.training.workdir import writes_to
 
 TRAIN_COLUMNS = (
@@ -68,7 +66,7 @@ class Outputs:
         *,
         owes_evaluation: bool = False,
     ) -> None:
-        """Opens the tables.
+        """Opens the tables and loggers.
 
         Args:
           workdir: the run's folder.
@@ -76,6 +74,9 @@ class Outputs:
           demonstrations: what the method imitates, or None.
           resume_frame: on a resume, rows of later frames are dropped.
           owes_evaluation: whether the evaluation of that frame will be played again.
+
+        Raises:
+          UsageError: the config's logger does not start.
         """
         self._workdir = workdir
         self._config = config
@@ -84,14 +85,19 @@ class Outputs:
         if evaluated is not None and owes_evaluation:
             evaluated -= 1
         with writes_to(workdir):
-            self._train, self._evaluations = (
-                CsvLog(workdir / name, columns, resume_frame=frame, say=say)
-                for name, columns, frame in (
-                    ("train.csv", (*TRAIN_COLUMNS, *own), resume_frame),
-                    ("eval.csv", EVAL_COLUMNS, evaluated),
+            tables = {
+                name: CsvLog(
+                    workdir / f"{name}.csv", columns, resume_frame=frame, say=say
                 )
-            )
-            self._events = _Events(workdir / "tensorboard", resume_frame)
+                for name, columns, frame in (
+                    ("train", (*TRAIN_COLUMNS, *own), resume_frame),
+                    ("eval", EVAL_COLUMNS, evaluated),
+                )
+            }
+            self._loggers: list[loggers.Logger] = [
+                loggers.Tables(**tables),
+                *loggers.make(config, workdir, resume_frame),
+            ]
         self._expert_return: float | None = None
         if demonstrations is not None:
             self._expert_return = demonstrations.mean_return()
@@ -159,7 +165,6 @@ class Outputs:
           A line for the terminal.
         """
         row: dict[str, Any] = {
-            "frame": frame,
             "seconds": round(seconds, 3),
             "episode": episode,
             "task_return_mean": evaluation.mean,
@@ -172,8 +177,7 @@ class Outputs:
             row["wasserstein_to_expert"] = distance
         config = self._config
         with writes_to(self._workdir):
-            self._evaluations.append(row)
-            self._events.write("eval", row)
+            self._write_scalars("eval", frame, row)
             learning_curve.plot(
                 self._workdir / "learning_curve.png",
                 self._workdir / "eval.csv",
@@ -195,18 +199,21 @@ class Outputs:
         return line
 
     def close(self) -> None:
-        """Closes the events' file."""
+        """Closes the loggers."""
         with writes_to(self._workdir):
-            self._events.close()
+            for logger in self._loggers:
+                logger.close()
 
     def _write_training(
         self, frame: int, seconds: float, episode: int, values: Mapping[str, Any]
     ) -> None:
-        row = {"frame": frame, "seconds": round(seconds, 3), "episode": episode}
-        row |= values
+        row = {"seconds": round(seconds, 3), "episode": episode, **values}
         with writes_to(self._workdir):
-            self._train.append(row)
-            self._events.write("train", row)
+            self._write_scalars("train", frame, row)
+
+    def _write_scalars(self, group: str, frame: int, row: Mapping[str, Any]) -> None:
+        for logger in self._loggers:
+            logger.write_scalars(group, frame, row)
 
     def _write_video(
         self,
@@ -220,49 +227,11 @@ class Outputs:
         np.savez_compressed(packed, **filmed)  # pyright: ignore[reportArgumentType]
         write_atomically(folder / f"frame_{frame:09d}.npz", packed.getvalue())
         frames, captions = zip(*sides)
-        video.write_video(
-            folder / f"frame_{frame:09d}.mp4",
-            *frames,
-            fps=frames_per_second(len(frames[0])),
-            labels=captions,
-        )
-
-
-class _Events:
-    """The same numbers for TensorBoard."""
-
-    def __init__(self, folder: pathlib.Path, resume_frame: int | None) -> None:
-        """Starts a file; on a resume, TensorBoard drops what is after that frame."""
-        from tensorboardX import event_file_writer  # slow to import
-        from tensorboardX.proto import event_pb2
-
-        messages: Any = event_pb2  # whose classes are made at run time
-        folder.mkdir(exist_ok=True)
-        # Not its SummaryWriter: on a full disk its thread dies, and the program then
-        # waits for it forever.
-        self._writer = event_file_writer.EventsWriter(str(folder / "events"))
-        self._event = messages.Event
-        if resume_frame is not None:
-            start = messages.SessionLog(status=messages.SessionLog.START)
-            self._write(step=resume_frame + 1, session_log=start)
-
-    def write(self, group: str, row: Mapping[str, Any]) -> None:
-        """Writes one row of a table, each column as GROUP/COLUMN."""
-        values = [
-            {"tag": f"{group}/{column}", "simple_value": float(value)}
-            for column, value in row.items()
-            # Of metrics that do not exist yet, such as before the first update.
-            if column != "frame" and math.isfinite(value)
-        ]
-        self._write(step=int(row["frame"]), summary={"value": values})
-
-    def close(self) -> None:
-        """Closes the file."""
-        self._writer.close()
-
-    def _write(self, **fields: Any) -> None:
-        self._writer.write_event(self._event(wall_time=time.time(), **fields))
-        self._writer.flush()
+        path = folder / f"frame_{frame:09d}.mp4"
+        fps = frames_per_second(len(frames[0]))
+        video.write_video(path, *frames, fps=fps, labels=captions)
+        for logger in self._loggers:
+            logger.write_video(frame, path)
 
 
 def as_floats(metrics: Mapping[str, Any]) -> dict[str, float]:

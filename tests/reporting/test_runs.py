@@ -183,7 +183,7 @@ def test_only_settings_that_matter_split_a_group(tmp_path):
 
     pdac = [
         read("a", "pdac"),
-        read("b", "pdac", eval_every_frames=20, video_every_evals=0),
+        read("b", "pdac", eval_every_frames=20, video_every_evals=0, logger="wandb"),
         read("speed", "pdac", encoder__convolutions="xla", replay_on_device=True),
     ]
     assert len(groups.make_groups(pdac)) == 1

@@ -1,9 +1,13 @@
 """What a run writes beside its checkpoints, and what it says when it cannot."""
 
+import ast
 import contextlib
 import errno
+import importlib.metadata
+import os
 import pathlib
 import shutil
+import time
 
 import matplotlib.image
 import numpy as np
@@ -11,17 +15,21 @@ import pytest
 
 from jaxil import config as jaxil_config
 from jaxil.environments.evaluation import Evaluation
+from jaxil.errors import UsageError
 from jaxil.files.tables import CsvLog, read_csv
-from jaxil.training import learning_curve, run_log
+from jaxil.training import film, learning_curve, loggers, run_log
 from jaxil.training.workdir import RunFolderError
+from tests.commands import call
+from tests.processes import wait_for
 
 
 @pytest.fixture
 def make_outputs():
     made = []
 
-    def make(folder, resume_frame=None):
+    def make(folder, resume_frame=None, logger=""):
         config = jaxil_config.default_config("drqv2", "cartpole_swingup")
+        config.logger = logger
         made.append(run_log.Outputs(folder, config, None, resume_frame))
         return made[-1]
 
@@ -44,10 +52,20 @@ def write_episode(outputs, frame=1000):
     )
 
 
-def write_evaluation(outputs, frame=1000):
+_SIDE = film.Side(np.zeros((2, 24, 24, 3), np.uint8), ["", ""])
+
+
+def write_evaluation(outputs, frame=1000, sides=()):
     evaluation = Evaluation([], np.array([10.0, 30.0]), [])
     return outputs.evaluation(
-        evaluation, frame, 20.0, 1, pre_tanh=4.0, distance=0.5, sides=[], filmed={}
+        evaluation,
+        frame,
+        20.0,
+        1,
+        pre_tanh=4.0,
+        distance=0.5,
+        sides=list(sides),
+        filmed={},
     )
 
 
@@ -71,6 +89,82 @@ def test_tables_events_and_curve(make_outputs, tmp_path):
     for tag in (b"train/task_return", b"eval/task_return_mean", b"train/critic/loss"):
         assert tag in content
     assert b"actor/loss" not in content  # of no update yet: it has no number
+
+
+_OWN = """
+import pathlib
+
+
+class Notes:
+    def __init__(self, workdir, config, resume_frame):
+        self.notes = [(config["method"], resume_frame)]
+
+    def write_scalars(self, group, frame, values):
+        self.notes.append((group, frame, values["seconds"]))
+
+    def write_video(self, frame, path):
+        self.notes.append((frame, path.name, path.is_file()))
+
+    def close(self):
+        pathlib.Path(__file__).with_name("notes").write_text(repr(self.notes))
+"""
+
+
+def test_a_logger_of_ones_own_gets_every_row_and_video(
+    make_outputs, tmp_path, monkeypatch
+):
+    (tmp_path / "own_logger.py").write_text(_OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert loggers.problems("own_logger:Notes") == []
+    assert "no attribute 'Note'" in str(loggers.problems("own_logger:Note"))
+    assert "must be wandb or" in str(loggers.problems("wanbd"))
+    outputs = make_outputs(tmp_path, 500, "own_logger:Notes")
+    write_episode(outputs)
+    write_evaluation(outputs, sides=[_SIDE])
+    outputs.close()
+    assert ast.literal_eval((tmp_path / "notes").read_text()) == [
+        ("drqv2", 500),
+        ("train", 1000, 10.0),
+        ("eval", 1000, 20.0),
+        (1000, "frame_000001000.mp4", True),
+    ]
+
+
+def test_weights_and_biases_logs_offline_and_goes_on_in_the_same_run(
+    make_outputs, tmp_path, monkeypatch
+):
+    for name in [name for name in os.environ if name.startswith("WANDB_")]:
+        monkeypatch.delenv(name)
+    outputs = make_outputs(tmp_path, logger="wandb")
+    write_episode(outputs)
+    write_evaluation(outputs, sides=[_SIDE])
+    outputs.close()
+    (first,) = tmp_path.glob("wandb/offline-run-*/run-*.wandb")
+    # W&B's own process closes the file, a moment later.
+    for word in (b"train/task_return", b"eval/task_return_mean", b"drqv2 on cartpole"):
+        wait_for(lambda word=word: word in first.read_bytes())
+    assert list(first.parent.glob("files/media/videos/*.mp4"))
+    time.sleep(1.0)  # names of W&B's folders hold whole seconds
+    make_outputs(tmp_path, 1000, "wandb").close()
+    assert len(list(tmp_path.glob(f"wandb/offline-run-*/{first.name}"))) == 2
+
+    monkeypatch.setenv("WANDB_MODE", "online")
+    monkeypatch.setenv("HOME", str(tmp_path))  # where nobody is logged in
+    config = jaxil_config.default_config("drqv2", "cartpole_swingup").to_dict()
+    with pytest.raises(UsageError, match="wandb login"):
+        loggers.WeightsAndBiases(tmp_path, config, None)
+
+
+def test_a_missing_weights_and_biases_is_one_message(tmp_path, monkeypatch):
+    def version(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(loggers.importlib.metadata, "version", version)
+    flags = ("--config=zero:cartpole_swingup", "--config.logger=wandb")
+    refused = call("launch", *flags, f"--workdir={tmp_path / 'run'}")
+    assert refused.returncode == 2
+    assert "pip install '.[wandb]'" in refused.stderr.splitlines()[-1]
+    assert not list(tmp_path.iterdir())
 
 
 def test_damaged_tables_do_not_stop_a_resumed_run(make_outputs, tmp_path, capsys):
