@@ -432,12 +432,13 @@ def test_replaced_rewards_come_back(tmp_path):
 def test_a_checkpoint_of_an_earlier_version_is_restored(
     tmp_path, monkeypatch, has_rewards
 ):
-    # Without rewards, at first; without a list of episodes and numbers in their files.
+    # Without rewards, at first; without a list of episodes and their checksums.
     replay, write = make_replay(), learner_files.write
     add_episodes(replay, 2)
 
     def write_as_before(folder, state, record, arrays):
-        del record["episodes"], record["episode_steps"]
+        for name in ("episodes", "episode_steps", "episode_checksums"):
+            del record[name]
         write(folder, state, record, arrays if has_rewards else {})
 
     monkeypatch.setattr(learner_files, "write", write_as_before)
