@@ -189,7 +189,9 @@ def test_state_expert_is_recorded_and_imitated(tmp_path):
     output.unlink()
     evaluated = call("evaluate", f"--workdir={tmp_path / 'agent'}", "--num_episodes=1")
     assert evaluated.returncode == 0, evaluated.stderr
-    assert f"the video is without the expert: {output} cannot be read" in evaluated.stderr
+    assert (
+        f"the video is without the expert: {output} cannot be read" in evaluated.stderr
+    )
     assert "the expert's" not in evaluated.stdout
 
 

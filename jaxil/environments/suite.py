@@ -6,6 +6,7 @@ No other module imports dm_control.
 import difflib
 import functools
 import importlib.metadata
+import logging
 import os
 from typing import Any
 
@@ -38,6 +39,10 @@ def _suite() -> Any:
         )
         os.environ["MUJOCO_GL"] = "disable"
         from dm_control import suite
+    # MuJoCo warns of an attribute in dm_control's own models, which no user can change.
+    logging.getLogger("absl").addFilter(
+        lambda record: "settotalmass" not in record.getMessage()
+    )
     return suite
 
 

@@ -73,8 +73,10 @@ def write_gif(
     """Writes what `write_video` would as an animated GIF that repeats for ever."""
     from PIL import Image
 
+    # Pillow's default, median cut, turns a small orange body on blue ground grey.
+    palette = Image.Quantize.FASTOCTREE
     images = (
-        Image.fromarray(image).quantize(_GIF_COLOURS, dither=Image.Dither.NONE)
+        Image.fromarray(image).quantize(_GIF_COLOURS, palette, dither=Image.Dither.NONE)
         for image in _images(frames_left, frames_right, labels)
     )
     first = next(images)

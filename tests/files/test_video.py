@@ -124,3 +124,16 @@ def test_a_gif_shows_the_same_with_a_text_for_each_frame(tmp_path):
         assert frame[22 + 168, 344 + 168, 2] > 190
     np.testing.assert_array_equal(seen[0], seen[2])
     assert np.any(seen[0][:22, :336] != seen[1][:22, :336])
+
+
+def test_a_gif_keeps_the_colour_of_a_small_body(tmp_path):
+    """As on dm_control's ground: 256 shades of blue, and little of anything else."""
+    ramp = np.linspace(0, 255, 256 * 256).reshape(256, 256)
+    frames = np.stack([ramp / 5, ramp / 3, ramp / 2 + 40], axis=-1)[None].repeat(2, 0)
+    frames[:, 120:130, 120:130] = (230, 165, 100)
+
+    write_gif(tmp_path / "body.gif", frames.astype(np.uint8), fps=10)
+
+    with Image.open(tmp_path / "body.gif") as image:
+        body = np.asarray(image.convert("RGB"))[22 + 125, 125].astype(int)
+    np.testing.assert_allclose(body, (230, 165, 100), atol=20)
