@@ -70,7 +70,6 @@ def _computation(method: str, convolutions: str) -> Any:
     import jax
     import numpy as np
 
-    from jaxil.maths.types import Episode
     from jaxil.training import agent as agents
     from jaxil.training import assembly
     from jaxil.training.updates import Updates
@@ -99,9 +98,8 @@ def _computation(method: str, convolutions: str) -> Any:
     for _ in range(3):  # so that no moment of Adam is zero
         state, _ = agent.update_step(state, *updates.sample(rng), None)
     batch, stored = updates.sample(rng), replay.episode(0)
-    unknown = np.full(runs.STEPS, np.nan, np.float32)
     # Backwards, so that it is no demonstration: its transport would cost nothing.
-    episode = Episode(stored.frames[::-1].copy(), stored.actions, unknown, unknown)
+    episode = stored._replace(frames=stored.frames[::-1].copy())
     rewarder = agent.observe(state.rewarder, state.params, episode, experts)
     state = state.replace(rewarder=rewarder)
     rewards = agent.rewards(rewarder, state.params, episode, experts)
