@@ -1,4 +1,4 @@
-"""Strictness for all tests: no silent broadcasting, and one way of drawing."""
+"""Strictness for all tests: no silent broadcasting, and one way of rendering."""
 
 import gc
 import os

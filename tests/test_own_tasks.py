@@ -264,6 +264,10 @@ def test_a_task_of_composer_is_seeded_rendered_and_cut_off():
     assert [step.last() for step in steps] == [False] * 4 + [True]
     assert steps[-1].discount == 1.0
     assert not np.array_equal(steps[-1].observation, starts[2])
+    large = environment.render(64)  # as for films: rendered so, not scaled
+    assert large.shape == (64, 64, 3)
+    scaled = np.repeat(np.repeat(environment.render(), 4, axis=0), 4, axis=1)
+    assert np.abs(large.astype(int) - scaled).max() > 50
     environment.close()
 
 

@@ -124,6 +124,7 @@ def load(
     camera: str = "",
     distraction: str = "none",
     cache: bool = True,
+    warns: bool = True,
     progress: Callable[[int, int], None] | None = None,
     **wanted: Any,
 ) -> Demonstrations:
@@ -135,6 +136,7 @@ def load(
       source: a file or folder of any format in `foreign.FORMATS`; "" for the task's
         shipped states.
       cache: whether to cache rendered images.
+      warns: whether to warn of what differs from the agent's observations.
       progress: called with (images done, all images) while rendering.
       wanted: the fields of `Wanted`; `task` is required.
 
@@ -145,20 +147,22 @@ def load(
     path = _path_of(source, request.task)
     if not states.recognises(path):
         loaded = _load_pixels(path, request)
-        mismatch.warn_of_pixels(
-            path,
-            loaded.metadata,
-            loaded.num_frames,
-            image_size=request.image_size,
-            task=request.task,
-            action_repeat=request.action_repeat,
-            fit=request.fit,
-        )
-        mismatch.warn_of_expert(path, request.num_episodes, *loaded[:4])
+        if warns:
+            mismatch.warn_of_pixels(
+                path,
+                loaded.metadata,
+                loaded.num_frames,
+                image_size=request.image_size,
+                task=request.task,
+                action_repeat=request.action_repeat,
+                fit=request.fit,
+            )
+            mismatch.warn_of_expert(path, request.num_episodes, *loaded[:4])
         return loaded
     stored, stride = _open_states(path, request)
     metadata = stored.metadata
-    mismatch.warn_of_versions(path, metadata["versions"])
+    if warns:
+        mismatch.warn_of_versions(path, metadata["versions"])
     rewards = _rewards(stored, stride)
     used = rewards.shape[1] * stride
     try:
@@ -180,7 +184,8 @@ def load(
     num_frames = np.full(len(rewards), rewards.shape[1] + 1)
     actions = stored.actions[:, :used:stride]
     found = frames, num_frames, actions, rewards
-    mismatch.warn_of_expert(path, request.num_episodes, *found)
+    if warns:
+        mismatch.warn_of_expert(path, request.num_episodes, *found)
     served = {"file": str(path), "action_repeat": request.action_repeat}
     metadata = {**metadata, **served, "returns": _returns(rewards)}
     return Demonstrations(*found, metadata)

@@ -164,8 +164,8 @@ class PixelEnvironment(dm_env.Environment):
     def render(self, image_size: int | None = None) -> np.ndarray:
         """Returns a new image, uint8 [H, W, 3], of the given size or the agent's."""
         images = _images_in(self._seen)
-        image = images[0] if len(images) == 1 else self._rendered()
         side = image_size or self.image_size
+        image = images[0] if len(images) == 1 else self._rendered(side)
         size = (side, side)
         if image.shape[:2] == size:
             return np.array(image)
@@ -203,11 +203,12 @@ class PixelEnvironment(dm_env.Environment):
             self._simulator.seed(int(seeds[0]))
         return self._simulator.reset()
 
-    def _rendered(self) -> np.ndarray:
+    def _rendered(self, side: int) -> np.ndarray:
         render = getattr(self._simulator, "render", None)
         if render is None:
             raise ValueError("neither observes one RGB image nor offers render().")
-        image = np.asarray(render())
+        scales = getattr(self._simulator, "renders_any_size", False)
+        image = np.asarray(render(side) if scales else render())
         if not _is_image(image):
             shape = f"{image.dtype} {image.shape}"
             raise ValueError(f"renders {shape}, but uint8 [H, W, 3] is expected.")

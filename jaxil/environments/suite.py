@@ -113,7 +113,8 @@ class SuiteEnvironment(PixelEnvironment):
 
     def render(self, image_size: int | None = None) -> np.ndarray:
         """Returns a new image of the agent's size; RuntimeError without usable GL."""
-        del image_size  # fixed when the camera is made
+        if image_size not in (None, self.image_size):
+            raise ValueError(f"image_size={image_size}: the camera's is fixed")
         if self._distraction.is_on:
             self.renderer.gl_name()  # opens the context
             self._distraction.upload()

@@ -94,7 +94,7 @@ def make_environment(
     if isinstance(getattr(own_task, "random", None), np.random.RandomState):
         return suite.wrap(simulator, **settings)
     if hasattr(simulator, "physics") and not hasattr(simulator, "render"):
-        simulator = _DmControl(simulator, settings["camera"], image_size)
+        simulator = _DmControl(simulator, settings["camera"])
         settings["camera"] = ""
     for name in _OF_DM_CONTROL:
         value = settings.pop(name)
@@ -121,8 +121,10 @@ class _DmControl:
     It can be seeded if it has a `random_state`.
     """
 
-    def __init__(self, inner: Any, camera: str, image_size: int) -> None:
-        self._inner, self._size = inner, image_size
+    renders_any_size = True
+
+    def __init__(self, inner: Any, camera: str) -> None:
+        self._inner = inner
         model = inner.physics.model
         # Without cameras, MuJoCo's free one.
         self._camera = suite.camera_index(model, camera, 0 if model.ncam else -1)
@@ -139,10 +141,9 @@ class _DmControl:
         if hasattr(self._inner, "random_state"):
             self._inner.random_state.seed(number)
 
-    def render(self) -> np.ndarray:
-        """Returns the current image."""
-        size, camera = self._size, self._camera
-        return self._inner.physics.render(size, size, camera_id=camera)
+    def render(self, side: int) -> np.ndarray:
+        """Returns the current image, uint8 [side, side, 3]."""
+        return self._inner.physics.render(side, side, camera_id=self._camera)
 
 
 class _Gymnasium(dm_env.Environment):

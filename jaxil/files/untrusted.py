@@ -4,9 +4,11 @@ import errno
 import os
 import pathlib
 import stat
+import zlib
 from typing import BinaryIO
 
 _MAX_BYTES = 2**28  # of a file that is read at once
+_PIECE_BYTES = 2**20
 
 
 def open_regular(path: str | os.PathLike) -> BinaryIO:
@@ -31,6 +33,15 @@ def read_regular(path: str | os.PathLike, max_bytes: int = _MAX_BYTES) -> bytes:
         if os.fstat(file.fileno()).st_size > max_bytes:
             raise ValueError(f"{path}: expected at most {max_bytes} bytes")
         return file.read()
+
+
+def checksum(path: str | os.PathLike) -> int:
+    """Returns a file's CRC-32; raises OSError as `open_regular` does."""
+    crc = 0
+    with open_regular(path) as file:
+        while piece := file.read(_PIECE_BYTES):
+            crc = zlib.crc32(piece, crc)
+    return crc
 
 
 def require_regular(path: str | os.PathLike, *, or_folder: bool = False) -> None:

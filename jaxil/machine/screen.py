@@ -23,7 +23,11 @@ class LastingStream:
         """Writes and flushes text."""
         stream = self._stream or sys.stderr
         try:
-            stream.write(text)
+            try:
+                stream.write(text)
+            except UnicodeEncodeError:  # such as bars of a sparkline in Latin-1
+                name = stream.encoding
+                stream.write(text.encode(name, "replace").decode(name))
             stream.flush()
         except (OSError, ValueError, AttributeError):  # closed, or None
             _give_up(stream)

@@ -3,12 +3,11 @@
 import pathlib
 import re
 import zipfile
-import zlib
 
 import numpy as np
 
 from jaxil.errors import printable
-from jaxil.files import archive, writing
+from jaxil.files import archive, untrusted, writing
 from jaxil.maths.types import Episode
 from jaxil.replay.replay import Replay
 
@@ -28,7 +27,7 @@ def write(folder: pathlib.Path, replay: Replay, index: int) -> int:
                 np.lib.format.write_array(
                     member, np.asanyarray(array), allow_pickle=False
                 )
-    return zlib.crc32(_path(folder, index).read_bytes())
+    return untrusted.checksum(_path(folder, index))
 
 
 def read_into(
@@ -50,7 +49,7 @@ def read_into(
         limits = dict.fromkeys(Episode._fields, archive.MAX_BYTES)
         arrays = archive.read_archive(path, max_bytes=limits)
         # Zip's own checksums miss a file that was swapped for another.
-        if checksum not in (None, zlib.crc32(path.read_bytes())):
+        if checksum not in (None, untrusted.checksum(path)):
             raise ValueError("has changed since it was written")
         replay.add_episode(**arrays)
     except (OSError, ValueError) as error:

@@ -199,6 +199,7 @@ def load_shown_expert(
         config.demonstrations.source,
         render_quality=config.render_quality,
         camera=config.camera,
+        warns=False,  # the run has warned, of the size that the agent sees
         progress=progress,
         **(_file_settings(config) | shown_as),
     )

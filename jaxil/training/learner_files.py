@@ -11,7 +11,6 @@ import os
 import pathlib
 import re
 import tempfile
-import zlib
 from typing import Any
 
 import jax
@@ -19,12 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxil.errors import printable
-from jaxil.files.untrusted import read_regular
+from jaxil.files.untrusted import checksum, read_regular
 
 _FORMAT = 1
 _CHECKSUMS = "checksums.json"
 _ROOM_BYTES = 2**17  # for what is written beside the arrays
-_MAX_BYTES = 2**40  # of a file: no limit for true ones
 
 
 class OtherLearnerError(ValueError):
@@ -184,7 +182,7 @@ def _kind(leaf: Any) -> str:
 
 
 def _checksums(folder: pathlib.Path, names: list[str]) -> dict[str, int]:
-    return {name: zlib.crc32(read_regular(folder / name, _MAX_BYTES)) for name in names}
+    return {name: checksum(folder / name) for name in names}
 
 
 def _one_line(error: Exception) -> str:

@@ -28,6 +28,15 @@ def test_a_closed_stream_is_given_up(tmp_path, monkeypatch):
     assert (tmp_path / "out").read_text() == ""
 
 
+def test_what_a_terminal_cannot_show_is_replaced(tmp_path):
+    with (tmp_path / "log").open("w", encoding="latin-1") as stream:
+        lasting = screen.LastingStream(stream)
+        lasting.write("return 1.0 ± 0.5 \u2581\u2588\n")
+        lasting.write("saved\n")
+    text = (tmp_path / "log").read_text(encoding="latin-1")
+    assert text == "return 1.0 ± 0.5 ??\nsaved\n"
+
+
 def test_text_from_files_cannot_command_the_terminal(capsys):
     hostile = "name\x1b[2J\r\x9b31m" + 10_000 * "x"
     screen.say(f"first {hostile}\nsecond")
