@@ -39,10 +39,12 @@ def test_a_request_to_stop_ends_the_rendering():
 def test_the_expert_is_shown_without_repeating_what_the_run_has_warned_of(
     tmp_path, caplog
 ):
-    config, *played = _played("pdac")
+    config, environment, evaluation = _played("pdac")
     config.demonstrations.source = str(tmp_path / "expert.npz")
     foreign_files.write_own(tmp_path / "expert.npz", 1)
-    _, expert = film.sides(config, *played, first_episode=3, image_size=32)
+    _, expert = film.sides(
+        config, environment, evaluation, first_episode=3, image_size=32
+    )
     assert expert.frames.shape == (4, 32, 32, 3)
     assert expert.captions[0] == "expert  0.0 s  return 0"
     assert not caplog.records
