@@ -20,7 +20,7 @@ from jaxil.training import workdir
 from jaxil.training.checkpoint import Checkpoints
 from tests.demonstrations.test_readers_fuzz import mutated_file
 from tests.reporting.run_folders import film, write_run
-from tests.training import test_checkpoint as saved
+from tests.training import saved_runs as saved
 
 FRAMES = (1000, 2000)
 _GROUPS = ("config.json", "eval.csv", "train.csv", "videos", "replay", "checkpoints")
@@ -127,13 +127,9 @@ def _read(folder: pathlib.Path) -> Iterator[str]:
 
 def _restore(folder: pathlib.Path) -> list[str]:
     """Compares what is restored with what was saved; returns what was said."""
-    said: list[str] = []
-    restored, expected = saved.make_replay(), saved.make_replay()
-    learner, counters = Checkpoints(folder, say=said.append).restore(
-        saved.ABSTRACT, restored
-    )
+    _, restored, learner, counters, said = saved.restore(folder)
     saved.assert_same_state(saved.make_state(counters["saved_at"]), learner)
-    saved.add_episodes(expected, FRAMES.index(counters["saved_at"]) + 1)
+    expected = saved.make_replay(FRAMES.index(counters["saved_at"]) + 1)
     for index in restored.episodes:
         pairs = zip(expected.episode(index), restored.episode(index), strict=True)
         for ours, theirs in pairs:
