@@ -14,7 +14,7 @@ from jaxil.learner.gathering import (
 )
 from jaxil.learner.update import make_update_step
 from jaxil.maths.types import Batch, ExpertBatch
-from tests.learner.test_update import (
+from tests.learner.small_learner import (
     ACTIONS,
     BATCH,
     PDAC,
