@@ -15,7 +15,7 @@ from jaxil import export
 from jaxil.files.tables import read_csv
 from jaxil.training import expert_distance, learning_curve, parts
 from tests.commands import ROOT, arguments, call, small_run
-from tests.demonstrations.foreign_files import open_video
+from tests.demonstrations.videos import open_video
 
 _CLOCKS = ("seconds", "frames_per_second", "reward_seconds")
 # Three episodes; rewards are refreshed at frames 2000 and 3000.

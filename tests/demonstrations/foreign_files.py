@@ -1,14 +1,10 @@
 """Small valid files of each foreign format, as their own programs would write them."""
 
-import io
-import json
 import pathlib
 import pickle
-from collections.abc import Sequence
-from fractions import Fraction
+import struct
 from typing import Any
 
-import av
 import numpy as np
 from PIL import Image
 
@@ -19,211 +15,25 @@ from jaxil.demonstrations.readers.recording import (
     Recording,
     checked,
 )
-
-CAMERA = "observation.images.front"  # in the datasets of LeRobot
+from tests.demonstrations.lerobot_datasets import lerobot_episode, make_lerobot_dataset
+from tests.demonstrations.minari_datasets import make_minari_dataset, minari_episode
+from tests.demonstrations.videos import encode_video
 
 
 def write_lerobot(path: pathlib.Path, seed: int) -> None:
     """A dataset's folder like LeRobot's of version 3, its video without loss."""
-    rng = np.random.default_rng(seed)
-    episodes = []
-    for num_frames in (3, 5):
-        episodes.append(
-            {
-                "frames": _random_frames(rng, num_frames),
-                "action": rng.uniform(-1, 1, (num_frames, 2)).astype(np.float32),
-                "next.reward": rng.uniform(size=num_frames).astype(np.float32),
-            }
-        )
-    make_lerobot_dataset(path, episodes)
-
-
-def make_lerobot_dataset(
-    path: pathlib.Path,
-    episodes: list[dict],
-    *,
-    as_images=False,
-    per_file=2,
-    gap=0,
-    **info,
-) -> None:
-    """Writes a dataset as the documentation of LeRobot describes version 3.
-
-    Args:
-      path: the dataset's folder, which is made.
-      episodes: each with frames [L, H, W, 3] and columns of L rows.
-      as_images: whether pictures are PNGs beside the actions; else a video is made.
-      per_file: episodes in a file.
-      gap: frames before each episode that belong to none.
-      **info: changes of meta/info.json.
-    """
-    rows = []
-    for index, episode in enumerate(episodes):
-        file, place = divmod(index, per_file)
-        before = episodes[file * per_file : index]
-        start = sum(len(other["frames"]) for other in before) + gap * (place + 1)
-        rows.append(
-            {
-                "episode_index": index,
-                "length": len(episode["frames"]),
-                "data/chunk_index": 0,
-                "data/file_index": file,
-                f"videos/{CAMERA}/chunk_index": 0,
-                f"videos/{CAMERA}/file_index": file,
-                f"videos/{CAMERA}/from_timestamp": start / 10,
-            }
-        )
-    make_parquet(path / "meta/episodes/chunk-000/file-000.parquet", rows)
-    for file in range(-(-len(episodes) // per_file)):
-        chosen = range(len(episodes))[file * per_file :][:per_file]
-        _write_lerobot_file(path, file, episodes, chosen, as_images, gap)
-    features = {
-        name: {"dtype": str(np.asarray(values).dtype), "shape": [1]}
-        for name, values in episodes[0].items()
-        if name != "frames"
-    }
-    features[CAMERA] = {"dtype": "image" if as_images else "video", "shape": [8, 8, 3]}
-    content = {
-        "codebase_version": "v3.0",
-        "fps": 10,
-        "total_episodes": len(episodes),
-        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-        "video_path": (
-            "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
-        ),
-        "features": features,
-        **info,
-    }
-    (path / "meta" / "info.json").write_text(json.dumps(content))
-
-
-def _write_lerobot_file(path, file, episodes, chosen, as_images, gap) -> None:
-    """Writes the data of some episodes, and the video of their frames."""
-    rows, frames = [], []
-    for index in chosen:
-        episode = episodes[index]
-        frames += [np.zeros_like(episode["frames"][:1])] * gap + [episode["frames"]]
-        columns = {name: values for name, values in episode.items() if name != "frames"}
-        for time in range(len(episode["frames"])):
-            row = {"episode_index": index, "frame_index": time}
-            row |= {name: values[time] for name, values in columns.items()}
-            if as_images:
-                picture = io.BytesIO()
-                Image.fromarray(episode["frames"][time]).save(picture, "PNG")
-                row[CAMERA] = {"bytes": picture.getvalue(), "path": f"{time}.png"}
-            rows.append(row)
-    name = f"chunk-000/file-{file:03d}"
-    make_parquet(path / f"data/{name}.parquet", rows)
-    if not as_images:
-        video = path / f"videos/{CAMERA}/{name}.mp4"
-        video.parent.mkdir(parents=True, exist_ok=True)
-        encode_video(video, np.concatenate(frames), fps=10, g="2")
-
-
-def make_parquet(path: pathlib.Path, rows: list[dict]) -> None:
-    """Writes rows of values, or of lists of values."""
-    import pyarrow
-    from pyarrow import parquet
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    columns = {
-        name: [
-            value.tolist() if hasattr(value, "tolist") else value for value in values
-        ]
-        for name in rows[0]
-        for values in [[row[name] for row in rows]]
-    }
-    parquet.write_table(pyarrow.table(columns), path, row_group_size=4)
+    make_lerobot_dataset(path, [lerobot_episode(3, seed), lerobot_episode(5, seed + 1)])
 
 
 def write_minari(path: pathlib.Path, seed: int) -> None:
     """A dataset's folder as Minari writes it; too small for its JPEGs."""
-    rng = np.random.default_rng(seed)
-    episodes = []
-    for num_steps in (3, 4):
-        episodes.append(
-            {
-                "observations": _random_frames(rng, num_steps + 1),
-                "actions": rng.uniform(-1, 1, (num_steps, 2)).astype(np.float32),
-                "rewards": rng.uniform(size=num_steps),
-            }
-        )
-    make_minari_dataset(path, episodes)
-
-
-def make_minari_dataset(
-    path: pathlib.Path, episodes: list[dict], *, observation_space=None, **options
-) -> None:
-    """Writes episodes by Minari.
-
-    Args:
-      path: the dataset's folder, which is made.
-      episodes: each with observations, actions and rewards.
-      observation_space: None for images like those of the first episode.
-      **options: of Minari's storage.
-    """
-    import gymnasium
-    from minari.data_collector.episode_buffer import EpisodeBuffer
-    from minari.dataset.minari_storage import MinariStorage
-
-    if observation_space is None:
-        shape = episodes[0]["observations"].shape[1:]
-        observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
-    actions = np.asarray(episodes[0]["actions"])
-    action_space = gymnasium.spaces.Discrete(9)
-    if actions.dtype.kind == "f":
-        action_space = gymnasium.spaces.Box(-1, 1, actions.shape[1:], np.float32)
-    path.mkdir()
-    storage = MinariStorage.new(
-        path / "data",
-        observation_space=observation_space,
-        action_space=action_space,
-        **options,
-    )
-    for episode in episodes:
-        ends = [False] * len(episode["rewards"])
-        buffer = EpisodeBuffer(**episode, terminations=ends, truncations=ends, infos={})
-        storage.update_episodes([buffer])
+    make_minari_dataset(path, [minari_episode(3, seed), minari_episode(4, seed + 1)])
 
 
 def write_video(path: pathlib.Path, seed: int) -> None:
     """An MP4 file of one episode, whose every pixel is kept."""
     frames = _random_frames(np.random.default_rng(seed), num_frames=5)
     encode_video(path, frames, format="mp4")
-
-
-def encode_video(
-    path: pathlib.Path,
-    frames: np.ndarray,
-    codec: str = "libx264rgb",
-    pixels: str = "rgb24",
-    *,
-    format: str | None = None,
-    fps: Fraction | int = 25,
-    times: Sequence[int] | None = None,
-    container_options: dict[str, str] | None = None,
-    **options: str,
-) -> None:
-    """Writes frames [T, H, W, 3], without loss unless the options say otherwise."""
-    if codec == "libx264rgb":
-        options = {"qp": "0", **options}
-    options_ = container_options or {}
-    with open_video(path, "w", format=format, options=options_) as container:
-        stream = container.add_stream(codec, Fraction(fps), options=options)
-        stream.height, stream.width = frames.shape[1:3]
-        stream.pix_fmt = pixels
-        for index, picture in enumerate(frames):
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture))
-            frame = frame.reformat(format=pixels)
-            frame.pts = index if times is None else times[index]
-            frame.time_base = 1 / Fraction(fps)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-
-
-def open_video(path: pathlib.Path, mode: Any = "r", **options: Any) -> Any:
-    """Opens a video by PyAV, whose own types of streams are too many."""
-    return av.open(path, mode, **options)
 
 
 def read_here(reader: Any, path: pathlib.Path, **options: Any):
@@ -330,6 +140,25 @@ def pickle_content(episodes, form: str) -> list:
     for array, column in zip(ragged, columns, strict=True):
         array[:] = column
     return ragged
+
+
+def python2_pickle(array: np.ndarray) -> bytes:
+    """Returns the instructions by which Python 2 pickled an array of uint8 [K, T, ...].
+
+    As its `cPickle` and `pickletools.dis` show them; strings there are bytes.
+    """
+    data = array.tobytes()
+    return b"".join(
+        [
+            b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\n",
+            b"K\0\x85U\1b\x87R(K\1(" + bytes(x for n in array.shape for x in (75, n)),
+            b"tcnumpy\ndtype\nU\2u1K\0K\1\x87R(K\3U\1|NNNJ\xff\xff\xff\xff",
+            b"J\xff\xff\xff\xffK\0tb\x89T"
+            + struct.pack("<i", len(data))
+            + data
+            + b"tb",
+        ]
+    )
 
 
 def drqv2_entries(frames, actions, rewards, num_frames=3) -> dict[str, np.ndarray]:

@@ -13,7 +13,8 @@ from jaxil.demonstrations.readers.recording import FormatError
 from jaxil.demonstrations.states import DemonstrationError
 from jaxil.environments import tasks
 from tests.demonstrations import foreign_files
-from tests.demonstrations.foreign_files import encode_video, read_here
+from tests.demonstrations.foreign_files import read_here
+from tests.demonstrations.videos import encode_video
 
 TASK = "cartpole_swingup"  # 100 frames a second
 FRAMES = np.random.default_rng(0).integers(0, 256, (12, 8, 8, 3), dtype=np.uint8)

@@ -10,7 +10,8 @@ from PIL import Image
 from jaxil.demonstrations import foreign
 from jaxil.demonstrations.readers import videos
 from jaxil.demonstrations.readers.recording import FormatError
-from tests.demonstrations.foreign_files import encode_video, open_video, read_here
+from tests.demonstrations.foreign_files import read_here
+from tests.demonstrations.videos import encode_video, open_video
 
 CODECS = {  # name of the file: settings, largest error in grey levels
     "plain.mp4": ({}, 0),

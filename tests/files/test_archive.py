@@ -3,12 +3,12 @@
 import os
 import pathlib
 import struct
-import tracemalloc
 
 import numpy as np
 import pytest
 
 from jaxil.files import archive
+from tests.bounds import bounded
 
 # An entry of a zip file's directory, "PK\1\2": the version needed to read it, tenfold,
 # and the flags stand at these places (PKWARE's APPNOTE, 4.3.12).
@@ -69,13 +69,9 @@ def test_all_arrays_together_are_bounded_before_any_is_unpacked(tmp_path):
     archive.write_archive(path, [(f"array{index}", zeros) for index in range(5)])
     assert path.stat().st_size < 50_000
     limits = {f"array{index}": size + 200 for index in range(5)}  # each by itself fits
-    tracemalloc.start()
-    try:
-        with pytest.raises(ValueError, match=f"in all .* more than the {size + 200}"):
-            archive.read_archive(path, max_bytes=limits)
-        assert tracemalloc.get_traced_memory()[1] < 1_000_000
-    finally:
-        tracemalloc.stop()
+    refused = pytest.raises(ValueError, match=f"in all .* more than the {size + 200}")
+    with bounded(num_bytes=1_000_000), refused:
+        archive.read_archive(path, max_bytes=limits)
     limits["array0"] = 6 * size  # the largest of the limits is that of all together
     assert len(archive.read_archive(path, max_bytes=limits)) == 5
 

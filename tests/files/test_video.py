@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from jaxil.files.video import write_gif, write_video
-from tests.demonstrations.foreign_files import open_video
+from tests.demonstrations.videos import open_video
 
 
 def read_video(path) -> tuple[tuple[int, int], float, np.ndarray]:

@@ -14,6 +14,7 @@ import pytest
 
 from jaxil.training.checkpoint import CheckpointError, Checkpoints
 from jaxil.training.workdir import RunFolderError
+from tests.files.damaged_archives import set_header_byte
 from tests.training.saved_runs import (
     add_episodes,
     assert_same_replay,
@@ -122,17 +123,6 @@ def test_a_damaged_newest_checkpoint_falls_back(tmp_path, seed):
     assert not again.said
 
 
-def _flag_members(path, offset, value):
-    """Changes one field of the zip's headers: what a member says of itself."""
-    content = bytearray(path.read_bytes())
-    for signature, shift in ((b"PK\x03\x04", 0), (b"PK\x01\x02", 2)):
-        place = content.find(signature)
-        while place >= 0:
-            content[place + offset + shift] = value
-            place = content.find(signature, place + 1)
-    path.write_bytes(bytes(content))
-
-
 def _become_a_folder(path):
     path.unlink()
     (path / "inner").mkdir(parents=True)
@@ -146,8 +136,8 @@ DAMAGES = {
     "other shape": lambda path: np.savez(
         path, frames=1, actions=1, rewards=1, discounts=1
     ),
-    "encrypted": lambda path: _flag_members(path, 6, 1),
-    "unknown compression": lambda path: _flag_members(path, 8, 99),
+    "encrypted": lambda path: set_header_byte(path, 6, 1),
+    "unknown compression": lambda path: set_header_byte(path, 8, 99),
 }
 
 
