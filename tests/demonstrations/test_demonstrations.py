@@ -1,9 +1,6 @@
-"""Demonstration files: round trips, the agent's own pixels, all kinds of damage."""
+"""Demonstration files: round trips, the agent's own pixels, cache, shipped files."""
 
-import json
 import logging
-import zipfile
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,79 +8,28 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxil.demonstrations import loading, rendering, sampling, states
-from jaxil.demonstrations.states import DemonstrationError, StateDemonstrations
+from jaxil.demonstrations.states import DemonstrationError
 from jaxil.environments.suite import make_environment
-from jaxil.files import archive
-
-TASK = "finger_turn_hard"  # its target is not part of the simulator's state
-NUM_EPISODES, NUM_STEPS, SIZE = 2, 4, 16
-SEED, FIRST_EPISODE = 5, 3
-VIEW = {"image_size": SIZE, "render_quality": "fast"}
-
-
-def record(action_repeat=2, num_steps=NUM_STEPS):
-    """Plays at random; returns the states to store and the frames that were seen."""
-    environment = make_environment(
-        TASK, seed=SEED, action_repeat=action_repeat, frame_stack=1, **VIEW
-    )
-    rng = np.random.default_rng(0)
-    stored: dict[str, list] = {
-        name: [] for name in ("qpos", "qvel", "act", "actions", "rewards", "frames")
-    }
-    for index in range(NUM_EPISODES):
-        environment.reset(episode=FIRST_EPISODE + index)
-        visited = [environment.simulator_state()]
-        frames = [environment.frame()]
-        actions = rng.uniform(-1, 1, (num_steps, 2)).astype(np.float32)
-        rewards = []
-        for action in actions:
-            rewards.append(environment.step(action).reward)
-            visited.append(environment.simulator_state())
-            frames.append(environment.frame())
-        for name in ("qpos", "qvel", "act"):
-            stored[name].append(np.stack([state[name] for state in visited]))
-        stored["actions"].append(actions)
-        stored["rewards"].append(np.array(rewards, np.float32))
-        stored["frames"].append(np.stack(frames))
-    environment.close()
-    arrays = {name: np.stack(values) for name, values in stored.items()}
-    frames = arrays.pop("frames")
-    metadata = states.new_metadata(
-        task=TASK,
-        action_repeat=action_repeat,
-        seed=SEED,
-        first_episode=FIRST_EPISODE,
-        expert="uniform actions",
-        rewards=arrays["rewards"],
-    )
-    return StateDemonstrations(**arrays, metadata=metadata), frames
-
-
-RECORDED, FRAMES = record()
+from tests.demonstrations.recorded_states import (
+    FIRST_EPISODE,
+    FRAMES,
+    NUM_EPISODES,
+    NUM_STEPS,
+    RECORDED,
+    SEED,
+    SIZE,
+    TASK,
+    VIEW,
+    assert_same,
+    load,
+    play,
+    write_recorded,
+)
 
 
 @pytest.fixture(name="path")
 def _path(tmp_path):
-    path = tmp_path / "demonstrations.npz"
-    states.write_states(path, RECORDED)
-    return path
-
-
-@pytest.fixture(autouse=True)
-def _own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("JAXIL_CACHE", str(tmp_path / "cache"))
-
-
-def load(path, **changes):
-    arguments = {"task": TASK, "num_episodes": NUM_EPISODES, "action_repeat": 2, **VIEW}
-    return loading.load(path, **(arguments | changes))
-
-
-def assert_same(first: StateDemonstrations, second: StateDemonstrations):
-    assert first.metadata == second.metadata
-    for one, other in zip(first[:-1], second[:-1], strict=True):
-        assert one.dtype == other.dtype
-        np.testing.assert_array_equal(one, other)
+    return write_recorded(tmp_path)
 
 
 # --- what is read back ----------------------------------------------------------------
@@ -188,27 +134,33 @@ def test_images_are_drawn_once_for_each_view(path, monkeypatch):
     np.testing.assert_array_equal(load(path).frames, FRAMES)
 
 
+def flip_a_byte(entry):
+    content = bytearray(entry.read_bytes())
+    content[len(content) // 2] ^= 1  # amid the pixels
+    entry.write_bytes(bytes(content))
+
+
+def become_another_file(entry):
+    with entry.open("wb") as file:
+        np.save(file, np.zeros(3))
+
+
 @pytest.mark.parametrize(
-    "damage", ["cut", "empty", "flipped byte", "other shape", "no array", "other file"]
+    "damage",
+    [
+        lambda entry: entry.write_bytes(entry.read_bytes()[:-10]),
+        lambda entry: entry.write_bytes(b""),
+        flip_a_byte,
+        lambda entry: np.savez(entry, images=np.zeros(3, np.uint8)),
+        lambda entry: np.savez(entry, x=np.zeros(3)),
+        become_another_file,
+    ],
+    ids=["cut", "empty", "flipped byte", "other shape", "no array", "other file"],
 )
 def test_damaged_cache_entries_are_rendered_again(path, tmp_path, damage):
     load(path)
     entry = min((tmp_path / "cache" / "frames").glob("*.npz"))
-    if damage == "cut":
-        entry.write_bytes(entry.read_bytes()[:-10])
-    elif damage == "empty":
-        entry.write_bytes(b"")
-    elif damage == "flipped byte":
-        content = bytearray(entry.read_bytes())
-        content[len(content) // 2] ^= 1  # amid the pixels
-        entry.write_bytes(bytes(content))
-    elif damage == "other shape":
-        np.savez(entry, images=np.zeros(3, np.uint8))
-    elif damage == "no array":
-        np.savez(entry, x=np.zeros(3))
-    else:
-        with entry.open("wb") as file:
-            np.save(file, np.zeros(3))
+    damage(entry)
     np.testing.assert_array_equal(load(path).frames, FRAMES)
     assert drawn_images(path) == 0
     assert not list(entry.parent.glob("*.part"))
@@ -229,172 +181,6 @@ def test_other_versions_are_said(path, caplog):
     with caplog.at_level(logging.WARNING):
         load(path)
     assert "mujoco 3.0.0" in caplog.text
-
-
-# --- faults ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (
-            {"task": "walker_walk"},
-            "shows finger_turn_hard, but the task is walker_walk",
-        ),
-        ({"num_episodes": 3}, "holds 2 episodes, but num_episodes=3. Use 1 to 2"),
-        ({"num_episodes": 0}, "but num_episodes=0. Use 1 to 2"),
-        ({"action_repeat": 3}, "recorded with action_repeat=2, not 3"),
-        ({"action_repeat": 1}, "Use a multiple of 2"),
-        ({"action_repeat": 10}, "shorter than one step of action_repeat=10"),
-    ],
-)
-def test_a_file_that_is_not_what_was_asked_for(path, changes, message):
-    arguments = {"task": TASK, "num_episodes": 2, "action_repeat": 2} | changes
-    for call in (load, loading.check):
-        with pytest.raises(DemonstrationError, match=message) as caught:
-            call(path, **arguments)
-        assert str(path) in str(caught.value)
-
-
-def tampered(path, change):
-    """Rewrites the file at `path` with `change` applied to its dict of arrays."""
-    with np.load(path) as archive:
-        arrays = dict(archive)
-    change(arrays)
-    np.savez(path, allow_pickle=True, **arrays)
-
-
-def set_metadata(arrays, **changes):
-    metadata = json.loads(str(arrays["metadata"]))
-    arrays["metadata"] = np.array(json.dumps({**metadata, **changes}))
-
-
-def set_nan(arrays):
-    arrays["qvel"][1, 2, 0] = np.nan
-
-
-TAMPERINGS = {
-    "missing array": (lambda a: a.pop("act"), "has no array act"),
-    "missing metadata": (lambda a: a.pop("metadata"), "has no array metadata"),
-    "nan": (set_nan, "NaN or infinity in qvel, episode 1"),
-    "wrong type": (
-        lambda a: a.update(qpos=a["qpos"].astype(np.float32)),
-        "qpos of type float32, but float64 is expected",
-    ),
-    "a state too few": (
-        lambda a: a.update(qpos=a["qpos"][:, :-1]),
-        r"qpos of shape \(2, 4, 3\) for rewards of \(2, 4\)",
-    ),
-    "an episode too few": (lambda a: a.update(actions=a["actions"][:1]), "actions of"),
-    "no episodes": (
-        lambda a: a.update({n: x[:0] for n, x in a.items() if n != "metadata"}),
-        r"rewards of shape \(0, 4\)",
-    ),
-    "another model": (
-        lambda a: a.update(qpos=a["qpos"][..., :-1]),
-        "qpos of 2 numbers, but finger_turn_hard needs 3",
-    ),
-    "actions of another model": (
-        lambda a: a.update(actions=a["actions"][..., :-1]),
-        "actions of 1 numbers, but finger_turn_hard needs 2",
-    ),
-    "pickled": (
-        lambda a: a.update(actions=np.array([{"a": 1}], dtype=object)),
-        "Python objects",
-    ),
-    "not json": (lambda a: a.update(metadata=np.array("{")), "not JSON"),
-    "deep json": (lambda a: a.update(metadata=np.array("[" * 99_999)), "not JSON"),
-    "a list": (lambda a: a.update(metadata=np.array("[]")), "not a file of demonstr"),
-    "another format": (lambda a: set_metadata(a, format="x"), "not a file of demonstr"),
-    "a later version": (
-        lambda a: set_metadata(a, version=2),
-        "version 2 of the format",
-    ),
-    "no task": (lambda a: set_metadata(a, task=None), "task=None, but str"),
-    "boolean": (lambda a: set_metadata(a, seed=True), "seed=True, but int"),
-    "negative": (lambda a: set_metadata(a, first_episode=-1), "first_episode=-1"),
-    "few returns": (lambda a: set_metadata(a, returns=[1.0]), "but 2 are expected"),
-    "no return": (lambda a: set_metadata(a, returns=[1.0, None]), "but 2 are expected"),
-}
-
-
-@pytest.mark.parametrize("name", TAMPERINGS)
-def test_files_that_break_the_rules_are_refused(path, name):
-    change, message = TAMPERINGS[name]
-    tampered(path, change)
-    with pytest.raises(DemonstrationError, match=message) as caught:
-        loading.check(path, task=TASK, num_episodes=2, action_repeat=2)
-    text = str(caught.value)
-    assert text.startswith(str(path))
-    assert text.count("\n") == 0
-    assert "jaxil.collect" in text
-
-
-@pytest.mark.parametrize(
-    "field", ["format", "version", "task", "camera", "seed", "returns", "versions"]
-)
-def test_text_of_a_file_is_made_harmless(path, field):
-    hostile: Any = "\x1b]0;owned\a\u202e\n" * 10_000
-    if field in ("returns", "versions"):
-        hostile = [hostile]
-    tampered(path, lambda arrays: set_metadata(arrays, **{field: hostile}))
-    with pytest.raises(DemonstrationError) as caught:
-        states.read_states(path, task=TASK)
-    assert str(caught.value).isprintable()
-    assert len(str(caught.value)) < 2500
-
-
-def test_a_file_cut_off_anywhere_is_refused(path):
-    content = path.read_bytes()
-    for length in range(0, len(content), 97):
-        path.write_bytes(content[:length])
-        with pytest.raises(DemonstrationError, match="cut off"):
-            states.read_states(path)
-
-
-@pytest.mark.parametrize("folder", [True, False])
-def test_a_file_that_cannot_be_opened(tmp_path, folder):
-    path = tmp_path if folder else tmp_path / "none.npz"
-    with pytest.raises(DemonstrationError, match="cannot be read"):
-        states.read_states(path)
-
-
-def test_arrays_that_would_fill_the_memory_are_not_unpacked(path, monkeypatch):
-    monkeypatch.setattr(archive, "MAX_BYTES", 300)
-    with pytest.raises(DemonstrationError, match=r"qpos of .* more than the 300"):
-        states.read_states(path)
-    # Each by itself is within the limit.
-    monkeypatch.setattr(archive, "MAX_BYTES", 1000)
-    monkeypatch.setattr(states, "_MAX_METADATA_BYTES", 1000)
-    tampered(path, lambda arrays: set_metadata(arrays, expert="", versions={}))
-    with pytest.raises(DemonstrationError, match=r"in all .* more than the 1000"):
-        states.read_states(path)
-
-
-def test_a_header_that_promises_more_than_there_is(path):
-    with zipfile.ZipFile(path) as whole:
-        members = {name: whole.read(name) for name in whole.namelist()}
-    # 2 episodes become 2 000 000 000; the blanks that pad the header make room for it.
-    members["qpos.npy"] = (
-        members["qpos.npy"]
-        .replace(b"(2, 5,", b"(2000000000, 5,")
-        .replace(b" " * 9, b"", 1)
-    )
-    with zipfile.ZipFile(path, "w") as changed:
-        for name, content in members.items():
-            changed.writestr(name, content)
-    with pytest.raises(
-        DemonstrationError, match="qpos whose header claims a wrong length"
-    ):
-        states.read_states(path)
-
-
-def test_the_writer_keeps_the_rules_and_the_old_file(path):
-    broken = RECORDED._replace(rewards=np.full_like(RECORDED.rewards, np.inf))
-    with pytest.raises(DemonstrationError, match="rewards"):
-        states.write_states(path, broken)
-    assert_same(states.read_states(path), RECORDED)
-    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
 
 
 # --- shipped --------------------------------------------------------------------------
@@ -443,36 +229,21 @@ def test_shipped_actions_played_again_lead_to_the_stored_states(task):
     stored = states.read_states(states.shipped_path(task), task=task)
     episode = len(stored.rewards) - 1
     metadata = stored.metadata
-    environment = make_environment(
-        task,
-        seed=metadata["seed"],
-        action_repeat=metadata["action_repeat"],
-        frame_stack=1,
-        **VIEW,
-    )
+    seed, action_repeat = metadata["seed"], metadata["action_repeat"]
+    environment = make_environment(task, seed=seed, action_repeat=action_repeat, **VIEW)
     number = metadata["first_episode"] + episode
-    environment.reset(episode=number)
-    frames, rewards, visited = [], [], []
-    for action in stored.actions[episode, :num_steps]:
-        visited.append(environment.simulator_state())
-        frames.append(environment.frame())
-        rewards.append(environment.step(action).reward)
+    actions = stored.actions[episode, :num_steps]
+    visited, frames, rewards = play(environment, number, actions)
     environment.close()
     np.testing.assert_allclose(rewards, stored.rewards[episode, :num_steps], atol=1e-4)
     moments = {
-        name: getattr(stored, name)[episode : episode + 1, :num_steps]
-        for name in ("qpos", "qvel", "act")
+        name: getattr(stored, name)[episode : episode + 1, : num_steps + 1]
+        for name in visited
     }
     for name, values in moments.items():
-        lived = np.stack([state[name] for state in visited])
-        np.testing.assert_allclose(lived, values[0], atol=1e-4, rtol=1e-4)
+        np.testing.assert_allclose(visited[name], values[0], atol=1e-4, rtol=1e-4)
     drawn = rendering.observe_episodes(
-        moments,
-        task=task,
-        seed=metadata["seed"],
-        first_episode=number,
-        cache=False,
-        **VIEW,
+        moments, task=task, seed=seed, first_episode=number, cache=False, **VIEW
     )
-    assert (drawn[0] != np.stack(frames)).mean() < 1e-3
+    assert (drawn[0] != frames).mean() < 1e-3
     assert drawn.std() > 1.0

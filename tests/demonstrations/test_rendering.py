@@ -61,11 +61,6 @@ def _alone(tmp_path_factory):
     return images, pixels_in(folder)
 
 
-@pytest.fixture(autouse=True)
-def _own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("JAXIL_CACHE", str(tmp_path / "cache"))
-
-
 def pixels_in(folder):
     found = {}
     for path in (folder / "frames").iterdir():
