@@ -1,4 +1,4 @@
-"""Imports point down: pure maths never learns about files, flags or simulators."""
+"""Imports point down: pure maths never learns of files or flags. Files are short."""
 
 import ast
 import pathlib
@@ -127,3 +127,17 @@ def test_the_reader_of_imports_sees_them_all():
     assert own_imports(source) == {"jaxil.config"}
     assert floor_of("jaxil.launch") == TOP
     assert floor_of("jaxil.maths.losses.td_target") == 1
+
+
+def test_files_are_short():
+    # Only tables of data may be longer, and none is written in these languages.
+    project = ROOT.parent
+    languages = {".py", ".sh", ".c", ".h", ".js", ".css", ".jinja"}
+    lengths = {
+        path.relative_to(project).as_posix(): len(path.read_text().splitlines())
+        for folder in ("jaxil", "tests", "configs", "launch")
+        for path in (project / folder).rglob("*")
+        if path.suffix in languages
+    }
+    assert len(lengths) > 200
+    assert {path: length for path, length in lengths.items() if length > 350} == {}
