@@ -57,7 +57,7 @@ NOWHERE = "has an episode with an invalid location"
 ROW_FAULTS = {
     "no column": (INDEX_FILE, without("length"), "has no column length in file-000"),
     "an episode too few": (INDEX_FILE, lambda rows: rows[:2], "has 2 episodes, not"),
-    "an episode twice": (INDEX_FILE, set_row(1, episode_index=0), "has 3 episodes, n"),
+    "an episode twice": (INDEX_FILE, set_row(1, episode_index=0), "has 3 episodes"),
     "words": (INDEX_FILE, set_rows(length="many"), NOWHERE),
     "fractions": (INDEX_FILE, set_rows(length=2.5), NOWHERE),
     "an absent number": (INDEX_FILE, set_row(1, length=None), NOWHERE),
@@ -92,7 +92,7 @@ ROW_FAULTS = {
         set_row(1, action=None),
         "not numbers in action|unequal lengths",
     ),
-    "a short action": (DATA_FILE, set_row(1, action=[1.0]), "unequal lengths in act"),
+    "a short action": (DATA_FILE, set_row(1, action=[1.0]), "unequal lengths in"),
     "an action of nothing": (DATA_FILE, set_row(1, action=[1.0, None]), "not numbers"),
 }
 

@@ -327,7 +327,7 @@ WRONG = {
         "rewards that are neither array",
     ),
     "text": (ACTIONS, lambda _: ["left", "right"], "actions that are neither array"),
-    "too deep": (ACTIONS, lambda _: [[[[[1.0]]]]] * 2, "actions that are neither arr"),
+    "too deep": (ACTIONS, lambda _: [[[[[1.0]]]]] * 2, "actions that are neither"),
 }
 
 
