@@ -45,7 +45,8 @@ def record():
     environment.close()
     moments = [each[0] for each in played]
     arrays = {name: np.stack([each[name] for each in moments]) for name in moments[0]}
-    frames, rewards = (np.stack([each[place] for each in played]) for place in (1, 2))
+    frames = np.stack([each[1] for each in played])
+    rewards = np.stack([each[2] for each in played])
     metadata = states.new_metadata(
         task=TASK,
         action_repeat=2,

@@ -1,41 +1,33 @@
 """Foreign files as the agent gets them: size, frame skip, lengths, and what is said."""
 
 import contextlib
-import json
 import logging
 import os
 import pathlib
-import time
-import tracemalloc
-import zipfile
 
 import numpy as np
 import pytest
 
-from jaxil.demonstrations import foreign, loading, sampling
+from jaxil.demonstrations import foreign, sampling
 from jaxil.demonstrations.readers import own
 from jaxil.demonstrations.readers.frames import resized
 from jaxil.demonstrations.readers.recording import (
     FormatError,
     PixelEpisode,
-    Recording,
-    checked_episode,
 )
 from jaxil.demonstrations.states import DemonstrationError
-from jaxil.files import archive
-from tests.demonstrations import foreign_files, test_readers_fuzz
-
-TASK = "cartpole_swingup"  # 100 control steps in a second
-LIMIT = 2**30
-
-
-def make_episode(num_steps=6, size=8, seed=0, action_dim=1):
-    rng = np.random.default_rng(seed)
-    return PixelEpisode(
-        rng.integers(0, 256, (num_steps + 1, size, size, 3), dtype=np.uint8),
-        rng.uniform(-1, 1, (num_steps, action_dim)).astype(np.float32),
-        rng.uniform(0, 1, num_steps).astype(np.float32),
-    )
+from tests.bounds import bounded
+from tests.demonstrations import foreign_files
+from tests.demonstrations.lerobot_datasets import DATA_FILE, VIDEO_FILE
+from tests.demonstrations.pixel_files import (
+    LIMIT,
+    TASK,
+    check,
+    load,
+    make_episode,
+    write,
+)
+from tests.demonstrations.test_readers_fuzz import FORMATS
 
 
 def known(array: np.ndarray | None) -> np.ndarray:
@@ -43,128 +35,9 @@ def known(array: np.ndarray | None) -> np.ndarray:
     return array
 
 
-def make_recording(episodes, **facts):
-    return Recording("made up", len(episodes), iter(episodes), **facts)
-
-
-def write(path, episodes, **facts):
-    own.write_pixels(path, make_recording(episodes, **facts), origin="a test")
-    return path
-
-
-def load(path, **changes):
-    settings = {
-        "task": TASK,
-        "num_episodes": 2,
-        "action_repeat": 2,
-        "image_size": 8,
-        "render_quality": "fast",
-    }
-    return loading.load(path, **(settings | changes))
-
-
 @pytest.fixture(name="path")
 def _path(tmp_path):
     return tmp_path / "pixels.npz"
-
-
-# --- our own file ---------------------------------------------------------------------
-
-
-def test_what_is_written_is_read(path):
-    episodes = [make_episode(4), make_episode(6, seed=1)._replace(rewards=None)]
-    write(path, episodes, task=TASK, action_repeat=2, frames_per_second=50.0)
-    recording = foreign.open_recording(path, max_bytes=LIMIT)
-    assert recording.kind == "jaxil pixels"
-    assert (recording.task, recording.action_repeat) == (TASK, 2)
-    assert recording.frames_per_second == 50.0
-    assert "a test" in recording.notes[0]
-    read = list(recording.episodes)
-    assert len(read) == recording.num_episodes == 2
-    for one, other in zip(read, episodes, strict=True):
-        for got, expected in zip(one[:3], other[:3], strict=True):
-            assert (got is None) == (expected is None)
-            if expected is not None:
-                np.testing.assert_array_equal(got, expected)
-
-
-def test_a_broken_recording_leaves_the_old_file(path):
-    write(path, [make_episode()])
-    before = path.read_bytes()
-
-    def episodes():
-        yield make_episode()
-        raise FormatError("is cut off")
-
-    with pytest.raises(FormatError):
-        own.write_pixels(path, Recording("x", 2, episodes()), origin="x")
-    assert path.read_bytes() == before
-    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
-
-
-def set_metadata(path, **changes):
-    with zipfile.ZipFile(path) as whole:
-        members = {name: whole.read(name) for name in whole.namelist()}
-    arrays = archive.read_archive(path, max_bytes={"metadata": 10**6})
-    metadata = {**json.loads(str(arrays["metadata"])), **changes}
-    with zipfile.ZipFile(path, "w") as changed:
-        for name, content in members.items():
-            if name != "metadata.npy":
-                changed.writestr(name, content)
-        with changed.open("metadata.npy", "w") as member:
-            np.lib.format.write_array(member, np.array(json.dumps(metadata)))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"format": "x"}, "lack the format name"),
-        ({"version": 2}, "version 2 of the format"),
-        ({"action_repeat": "2"}, "action_repeat='2', not int"),
-        ({"frames_per_second": 0.0}, "frames_per_second=0.0"),
-        ({"task": 1}, "task=1, not str"),
-        ({"origin": None}, "without origin"),
-    ],
-)
-def test_metadata_that_break_the_rules(path, changes, message):
-    write(path, [make_episode(), make_episode(seed=1)])
-    set_metadata(path, **changes)
-    with pytest.raises(FormatError, match=message):
-        list(foreign.open_recording(path, max_bytes=LIMIT).episodes)
-
-
-def test_an_array_above_the_limit_is_not_unpacked(path):
-    write(path, [make_episode()])
-    with pytest.raises(FormatError, match="frames_0 of 1472 bytes, more than the 1000"):
-        list(foreign.open_recording(path, max_bytes=1000).episodes)
-
-
-# --- the rules of an episode ----------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda e: e._replace(frames=e.frames[..., :1]), "uint8"),
-        (lambda e: e._replace(frames=e.frames.astype(np.float32)), "float32"),
-        (lambda e: e._replace(frames=e.frames[:1]), "1 frames"),
-        (lambda e: e._replace(frames=e.frames[:, :0]), "8x0 pixels"),
-        (lambda e: e._replace(actions=e.actions[:-1]), "actions of type"),
-        (lambda e: e._replace(actions=e.actions[:, 0]), "actions of type"),
-        (lambda e: e._replace(rewards=e.rewards[:, None, None]), "rewards of type"),
-        (lambda e: e._replace(rewards=e.rewards * np.float32("nan")), "not finite"),
-        (
-            lambda e: e._replace(actions=e.actions + np.float64(1e300)),
-            "not finite",
-        ),
-        (lambda e: e._replace(actions=e.actions + 0j), "actions of type complex"),
-    ],
-)
-def test_episodes_that_break_the_rules_are_refused(change, message):
-    assert checked_episode(3, make_episode()).rewards is not None
-    with pytest.raises(FormatError, match=message) as caught:
-        checked_episode(3, change(make_episode()))
-    assert "episode 3" in str(caught.value)
 
 
 # --- what the agent gets --------------------------------------------------------------
@@ -293,22 +166,20 @@ def test_what_cannot_match_is_said(path, caplog):
 )
 def test_a_file_that_cannot_serve(path, changes, message):
     write(path, [make_episode(), make_episode()], task=TASK)
-    settings = {"task": TASK, "num_episodes": 2, "action_repeat": 2, "image_size": 8}
-    for call in (load, lambda *a, **k: loading.check(*a, **(settings | k))):
+    for call in (load, check):
         with pytest.raises(DemonstrationError, match=message) as caught:
             call(path, **changes)
         assert str(path) in str(caught.value)
 
 
 def test_actions_are_needed_only_where_they_are_seen(path):
-    settings = {"task": TASK, "num_episodes": 1, "action_repeat": 2, "image_size": 8}
     write(path, [make_episode(action_dim=3)])
-    loading.check(path, **settings)
+    check(path, num_episodes=1)
     with pytest.raises(DemonstrationError, match=r"actions of 3 numbers.*needs 1"):
-        loading.check(path, sees_actions=True, **settings)
+        check(path, num_episodes=1, sees_actions=True)
     write(path, [make_episode()._replace(actions=None)])
     with pytest.raises(DemonstrationError, match="holds no actions"):
-        loading.check(path, sees_actions=True, **settings)
+        check(path, num_episodes=1, sees_actions=True)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"hello", b"PK\x03\x04", "folder"])
@@ -334,8 +205,7 @@ def test_a_file_is_read_once_until_it_changes(path, monkeypatch):
         return read(*args, **kwargs)
 
     monkeypatch.setattr(foreign, "read_episodes", counted)
-    settings = {"task": TASK, "num_episodes": 2, "action_repeat": 2, "image_size": 8}
-    loading.check(path, **settings)
+    check(path)
     first = load(path)
     assert len(calls) == 1
     write(path, [make_episode(seed=5), make_episode(seed=6)])
@@ -343,20 +213,7 @@ def test_a_file_is_read_once_until_it_changes(path, monkeypatch):
     assert len(calls) == 2
 
 
-# --- what is never opened, and what never reaches a terminal --------------------------
-
-
-@contextlib.contextmanager
-def bounded(seconds=5.0, num_bytes=10**7):
-    """Fails unless what is inside ends soon and allocates little."""
-    start = time.monotonic()
-    tracemalloc.start()
-    try:
-        yield
-        assert tracemalloc.get_traced_memory()[1] < num_bytes
-        assert time.monotonic() - start < seconds
-    finally:
-        tracemalloc.stop()
+# --- what is never opened -------------------------------------------------------------
 
 
 @pytest.mark.parametrize("source", ["/dev/zero", "/dev/full", "pipe", "pipe.mp4"])
@@ -366,7 +223,7 @@ def test_only_regular_files_and_folders_are_opened(source, tmp_path):
         path = tmp_path / source
         os.mkfifo(path)
     with (
-        bounded(),
+        bounded(seconds=5.0),
         pytest.raises(DemonstrationError, match="is a pipe, device or sock"),
     ):
         load(path)
@@ -378,64 +235,36 @@ def test_only_regular_files_and_folders_are_opened(source, tmp_path):
         ("minari", "data/metadata.json"),
         ("minari", "data/main_data.hdf5"),
         ("lerobot", "meta/info.json"),
-        ("lerobot", "data/chunk-000/file-000.parquet"),
-        ("lerobot", f"videos/{foreign_files.CAMERA}/chunk-000/file-000.mp4"),
+        ("lerobot", DATA_FILE),
+        ("lerobot", VIDEO_FILE),
         ("replays", "20220101T000000_0_3.npz"),
-        ("video", "b.mp4"),
+        ("videos", "b.mp4"),
     ],
 )
 def test_pipes_in_a_folder_are_not_opened(name, file, tmp_path):
-    pytest.importorskip({"minari": "minari", "lerobot": "pyarrow"}.get(name, "numpy"))
+    pytest.importorskip(FORMATS[name].library)
     source = tmp_path / "source"
-    if name == "video":
+    if name == "videos":
         source.mkdir()
         foreign_files.write_video(source / "a.mp4", 0)
     else:
-        getattr(foreign_files, f"write_{name}")(source, 0)
+        getattr(foreign_files, FORMATS[name].write)(source, 0)
     (source / file).unlink(missing_ok=True)
     os.mkfifo(source / file)
-    started = time.monotonic()
-    with bounded(seconds=60.0), contextlib.suppress(FormatError):
+    with bounded(), contextlib.suppress(FormatError):  # nobody writes into the pipe
         list(foreign.open_recording(source, max_bytes=LIMIT).episodes)
-    assert time.monotonic() - started < 60.0  # nobody writes into the pipe
-
-
-def test_text_of_a_file_is_made_harmless(path, caplog):
-    escape = "\x1b[31m\x07\u202e" + "x" * 10**5
-    write(path, [make_episode(), make_episode()])
-    set_metadata(path, origin=escape)
-    with caplog.at_level(logging.WARNING):
-        load(path)
-    assert "?[31m??xxx" in caplog.text
-    assert len(caplog.text) < 2000
-    for changes in ({"task": escape}, {"format": escape, "version": escape}):
-        set_metadata(path, **changes)
-        with pytest.raises(DemonstrationError) as caught:
-            load(path)
-        assert len(str(caught.value)) < 2000
-        assert not {"\x1b", "\x07", "\u202e"} & set(str(caught.value))
 
 
 # --- all formats ----------------------------------------------------------------------
 
 
-WRITERS = {
-    name.removeprefix("write_"): getattr(foreign_files, name)
-    for name in dir(foreign_files)
-    if name.startswith("write_")
-}
-
-
-@pytest.mark.parametrize("name", sorted(WRITERS))
+@pytest.mark.parametrize("name", FORMATS)
 def test_each_format_gives_the_same_demonstrations_after_conversion(
     name, tmp_path, path
 ):
-    if name == "minari":
-        pytest.importorskip("minari")
-    if name == "lerobot":
-        pytest.importorskip("pyarrow")
+    pytest.importorskip(FORMATS[name].library)
     source = tmp_path / "source"
-    WRITERS[name](source, 0)
+    getattr(foreign_files, FORMATS[name].write)(source, 0)
     recording = foreign.open_recording(source, max_bytes=LIMIT)
     assert (recording.kind == "jaxil pixels") == (name == "own")
     own.write_pixels(path, recording, origin="a test")
@@ -459,5 +288,6 @@ def test_a_dataset_with_a_preview_is_no_folder_of_videos(tmp_path):
 
 
 def test_the_fuzzer_knows_every_format():
-    assert len(WRITERS) == len(foreign._READERS)
-    assert len(test_readers_fuzz.FORMATS) == len(WRITERS)
+    writers = {name for name in dir(foreign_files) if name.startswith("write_")}
+    assert writers == {form.write for form in FORMATS.values()}
+    assert len(writers) == len(foreign._READERS)
