@@ -105,9 +105,6 @@ METHOD = methods.Method(
 """
 
 
-# What is refused, all of it together.
-
-
 def test_every_fault_of_every_run_is_told_once(tmp_path):
     (tmp_path / "file").touch()
     told = faults_of(
@@ -133,10 +130,8 @@ def test_every_fault_of_every_run_is_told_once(tmp_path):
 
 
 def test_a_fault_of_some_runs_says_which(tmp_path):
-    faults = [Fault("demonstrations", "are missing")]
-    (fault,) = faults_of(
-        tmp_path, lambda config: faults * (config.task == "walker_run")
-    )
+    missing = [Fault("demonstrations", "are missing")]
+    (fault,) = faults_of(tmp_path, lambda config: missing * ("walker" in config.task))
     assert fault == "demonstrations are missing [walker_run/pdac, walker_run/psil]"
 
 

@@ -113,7 +113,7 @@ def test_noise_follows_the_number_of_the_update(num_updates, std):
 
 @pytest.mark.parametrize(
     ("rewarder", "expert"),
-    [(PDAC, make_expert), (PSIL, None)],
+    [(PDAC, make_expert), (PSIL, lambda seed: None)],
     ids=["pdac", "psil"],
 )
 def test_compiles_once_and_donates_its_state(rewarder, expert):
@@ -128,9 +128,7 @@ def test_compiles_once_and_donates_its_state(rewarder, expert):
     episode, experts = make_episode(frames[0]), make_experts(frames[1:])
     for seed in range(3):
         old = state
-        state, _ = step(
-            state, make_batch(seed), None if expert is None else expert(seed)
-        )
+        state, _ = step(state, make_batch(seed), expert(seed))
         assert all(leaf.is_deleted() for leaf in jax.tree.leaves(old.params))
         # An episode in between must not change the state's types.
         observed = observe(state.rewarder, state.params, episode, experts)
@@ -156,8 +154,7 @@ def test_native_convolutions_learn_the_same_over_50_updates():
     learners = [make_learner(networks=each) for each in networks]
     states = [make_state(learner) for learner in learners]
     program = jax.make_jaxpr(make_update_step(learners[1]))
-    uses_ours = "jaxil_encode" in str(program(states[1], make_batch(0), None))
-    assert uses_ours
+    assert "jaxil_encode" in str(program(states[1], make_batch(0), None))
     for number in range(50):
         batch = make_batch(number)
         states = [
@@ -169,9 +166,6 @@ def test_native_convolutions_learn_the_same_over_50_updates():
     )
     # Not for want of learning: what was learned is far larger than the tolerance.
     start = make_state(learners[0]).params
-    moved = jax.tree.map(
-        lambda a, b: float(jnp.max(jnp.abs(a - b))),
-        start.encoder,
-        states[0].params.encoder,
-    )
+    encoders = start.encoder, states[0].params.encoder
+    moved = jax.tree.map(lambda a, b: float(jnp.max(jnp.abs(a - b))), *encoders)
     assert min(jax.tree.leaves(moved)) > 2e-2

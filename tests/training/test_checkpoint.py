@@ -50,9 +50,7 @@ def test_leaves_come_back_as_what_they_were(tmp_path):
     Checkpoints(tmp_path).save(
         frame=0, learner_state=state, counters={}, replay=make_replay()
     )
-
     restored, _ = Checkpoints(tmp_path).restore(state)
-
     assert type(restored["count"]) is int
     assert type(restored["scale"]) is float
     assert type(restored["mean"]) is np.ndarray
@@ -71,14 +69,11 @@ def test_episodes_are_written_once_and_go_after_the_checkpoints_that_need_them(
     add_episodes(replay, 2)  # 0 is evicted: three fit
     save(checkpoints, 2, replay)
     after = episode_files_of(tmp_path)
-
     assert len(before) == 2
     assert set(after) == {f"episode_{i:08d}.npz" for i in range(4)}
     assert {name: after[name] for name in before} == before
-
     add_episodes(replay, 1)
     save(checkpoints, 3, replay)
-
     # Kept are the checkpoints 2 (episodes 1 to 3) and 3 (2 to 4).
     assert set(episode_files_of(tmp_path)) == {
         f"episode_{i:08d}.npz" for i in range(1, 5)
@@ -107,7 +102,6 @@ def test_replaced_rewards_come_back(tmp_path):
     for index in replay.episodes:
         replay.replace_rewards(index, -replay.rewards(index))
     save(checkpoints, 2, replay)
-
     assert episode_files_of(tmp_path) == before
     assert_same_replay(replay, restore(tmp_path).replay)
     # The others' also where one episode has been lost.
@@ -144,7 +138,6 @@ def test_strays_are_ignored(tmp_path):
     for folder in [path for path in tmp_path.rglob("*") if path.is_dir()]:
         (folder / ".DS_Store").write_bytes(b"\0\0\0\1Bud1")
     (tmp_path / "checkpoints" / "frame_000000000009.bak").mkdir()
-
     checkpoints, restored, _, _, said = restore(tmp_path)
     assert said == []
     assert_same_replay(make_replay(2), restored)
@@ -170,7 +163,6 @@ def test_one_frame_can_be_saved_twice(tmp_path):
 
 def test_without_a_checkpoint(tmp_path):
     checkpoints = Checkpoints(tmp_path / "nothing")
-
     assert checkpoints.newest() is None
     with pytest.raises(CheckpointError, match="expected a checkpoint, found none"):
         checkpoints.restore(ABSTRACT)
@@ -183,10 +175,8 @@ def test_a_checkpoint_of_another_learner_is_refused(tmp_path):
         ABSTRACT, actor=[{"kernel": jax.ShapeDtypeStruct((9, 5), jnp.float32)}, 1]
     )
     del other["flag"]
-
     with pytest.raises(CheckpointError) as caught:
         Checkpoints(tmp_path).restore(other)
-
     message = str(caught.value)
     assert "actor.0.kernel is float32[3, 5], expected float32[9, 5]" in message
     assert "actor.1 is missing" in message
@@ -195,6 +185,5 @@ def test_a_checkpoint_of_another_learner_is_refused(tmp_path):
 
 def test_saving_over_a_run_that_was_not_restored_is_refused(tmp_path):
     save(Checkpoints(tmp_path), 1, make_replay())
-
     with pytest.raises(CheckpointError, match="holds a checkpoint of frame 1"):
         save(Checkpoints(tmp_path), 2, make_replay())

@@ -107,14 +107,12 @@ def test_a_damaged_newest_checkpoint_falls_back(tmp_path, seed):
     add_episodes(replay, 2)
     save(checkpoints, 2, replay)
     flip_a_bit(tmp_path, "frame_000000000002", seed)
-
     survivor, restored, state, _, (said,) = restore(tmp_path)
     assert_same_state(make_state(1), state)
     assert_same_replay(make_replay(4), restored)
     assert said.startswith("the checkpoint of frame 2 is damaged (")
     assert said.endswith(": using that of frame 1")
     assert "\n" not in said
-
     # Resumed: another episode 4 than the damaged checkpoint knew, and another frame 2.
     add_episodes(restored, 1, num_steps=3)
     save(survivor, 2, restored)
@@ -146,7 +144,6 @@ def test_a_damaged_episode_is_left_out_and_named(tmp_path, damage):
     checkpoints, replay = Checkpoints(tmp_path), make_replay(3)
     save(checkpoints, 1, replay)
     DAMAGES[damage](tmp_path / "replay" / "episode_00000001.npz")
-
     checkpoints, restored, state, _, (said,) = restore(tmp_path)
     assert_same_state(make_state(1), state)
     assert restored.episodes == [0, 2]
@@ -155,7 +152,6 @@ def test_a_damaged_episode_is_left_out_and_named(tmp_path, damage):
             np.testing.assert_array_equal(a, b)
     assert said.startswith("1 damaged episodes are left out of the replay (episode_")
     assert "episode_00000001.npz: " in said
-
     # Resumed: its numbers go on, and later checkpoints have the gap without a word,
     # until the ring has moved past it.
     for frame in range(2, 6):
@@ -176,7 +172,6 @@ def test_exchanged_episodes_are_noticed(tmp_path):
     first.rename(tmp_path / "aside")
     second.rename(first)
     (tmp_path / "aside").rename(second)
-
     restored = restore(tmp_path)
     assert restored.replay.episodes == [1]
     assert "episode_00000000.npz: has changed since it was written" in restored.said[0]
@@ -190,7 +185,6 @@ def test_a_forged_episode_is_noticed_also_after_a_second_save(tmp_path):
     arrays = dict(np.load(path))
     arrays["rewards"] += 1
     np.savez(path, **arrays)  # with right checksums of its own
-
     restored = restore(tmp_path)
     assert restored.replay.episodes == [0]
     assert "episode_00000001.npz: has changed since it was written" in restored.said[0]
@@ -284,7 +278,6 @@ def test_when_all_are_damaged(tmp_path):
         save(checkpoints, frame, make_replay())
     for name in ("frame_000000000001", "frame_000000000002"):
         flip_a_bit(tmp_path, name, 0)
-
     with pytest.raises(
         CheckpointError, match=r"frame 2 is damaged.*frame 1 is damaged"
     ):
