@@ -1,7 +1,5 @@
 """PatchAIL: its patches, their similarity by hand, and its three rewards."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,11 +30,12 @@ def test_patches_of_an_image(side, patches):
 
 
 def test_a_patch_sees_22_pixels_and_is_2_from_the_next():
-    network = PatchDiscriminator(width=1)
     pixels = np.full((1, 48, 48, 2), 0.5, np.float32)
-    params = network.init(jax.random.key(0), pixels)
     pixels[0, 24, 27] = 1.0
-    seen = np.asarray(network.apply(params, pixels)).reshape(21, 21) != 0.0
+    logits, _ = jax.jit(PatchDiscriminator(width=1).init_with_output)(
+        jax.random.key(0), pixels
+    )
+    seen = np.asarray(logits).reshape(21, 21) != 0.0
     # Patch p is of rows 2 p - 7 to 2 p + 14.
     rows, columns = (set(places.tolist()) for places in np.nonzero(seen))
     assert rows == set(range(5, 16))
@@ -46,15 +45,15 @@ def test_a_patch_sees_22_pixels_and_is_2_from_the_next():
 def test_similarity_by_hand():
     # D = 1/2, 1/2 and 1/4, 3/4. KL(1/2, 1/2 | 1/4, 3/4) = log(4/3) / 2.
     logits = jnp.array([[0.0, 0.0], [-np.log(3.0), np.log(3.0)]])
-    found = patchail.patch_similarity(logits, jnp.array([0.25, 0.75]))
+    similarity = jax.jit(patchail.patch_similarity)
+    found = similarity(logits, jnp.array([0.25, 0.75]))
     np.testing.assert_allclose(found, [np.sqrt(0.75), 1.0], rtol=1e-5)
-    large = patchail.patch_similarity(jnp.array([[-500.0, 500.0]]), jnp.full(2, 0.5))
-    np.testing.assert_allclose(large, [0.5], rtol=1e-5)
+    large = similarity(1_000.0 * logits, jnp.array([0.5, 0.5]))
+    np.testing.assert_allclose(large, [1.0, 0.5], rtol=1e-5)
     with pytest.raises(AssertionError):
         patchail.patch_similarity(logits, jnp.full(3, 1 / 3))
 
 
-@functools.cache
 def make_rewarder(variant):
     return patchail.make_rewarder(
         make_agent(),
@@ -68,17 +67,22 @@ def make_rewarder(variant):
 
 
 def test_variants_weigh_the_mean_logit_or_add_to_it():
-    episode, rewards = make_episode(random_frames(0, 6)), {}
-    for variant in ("plain", "weighted", "bonus"):
-        rewarder = make_rewarder(variant)
-        state = rewarder.init(jax.random.key(0), make_spec(expert_steps=4), NOBODY)
-        state = rewarder.observe(state, NOBODY, episode, None)
-        rewards[variant] = np.asarray(rewarder.rewards(state, NOBODY, episode, None))
-        if variant == "bonus":
-            later = make_episode(random_frames(1, 4, high=9))
-            assert rewarder.observe(state, NOBODY, later, None).scale == state.scale
-    mean = rewards["plain"]
-    weights, bonuses = rewards["weighted"] / mean, rewards["bonus"] - 0.5 * mean
+    first, later = (make_episode(random_frames(seed, 6)) for seed in (0, 1))
+
+    @jax.jit
+    def play(first, later):
+        rewards = {}
+        for variant in ("plain", "weighted", "bonus"):
+            rewarder = make_rewarder(variant)
+            state = rewarder.init(jax.random.key(0), make_spec(expert_steps=4), NOBODY)
+            for episode in (first, later):  # the first one sets the scale
+                state = rewarder.observe(state, NOBODY, episode, None)
+            rewards[variant] = rewarder.rewards(state, NOBODY, first, None)
+        return rewards
+
+    rewards = jax.tree.map(np.asarray, play(first, later))
+    weights = rewards["weighted"] / rewards["plain"]
+    bonuses = rewards["bonus"] - 0.5 * rewards["plain"]
     np.testing.assert_allclose(np.mean(weights), 1.3, rtol=1e-3)
     np.testing.assert_allclose(np.mean(bonuses), 0.5, rtol=1e-3)
     np.testing.assert_allclose(weights / 1.3, bonuses / 0.5, rtol=1e-3)
