@@ -30,11 +30,11 @@ def test_patches_of_an_image(side, patches):
 
 
 def test_a_patch_sees_22_pixels_and_is_2_from_the_next():
-    pixels = np.full((1, 48, 48, 2), 0.5, np.float32)
+    network, pixels = PatchDiscriminator(width=1), np.full((1, 48, 48, 2), 0.5)
     pixels[0, 24, 27] = 1.0
-    logits, _ = jax.jit(PatchDiscriminator(width=1).init_with_output)(
-        jax.random.key(0), pixels
-    )
+    shapes = jax.eval_shape(network.init, jax.random.key(0), pixels)
+    positive = jax.tree.map(lambda leaf: np.full(leaf.shape, leaf.ndim > 1), shapes)
+    logits = jax.jit(network.apply)(positive, pixels)
     seen = np.asarray(logits).reshape(21, 21) != 0.0
     # Patch p is of rows 2 p - 7 to 2 p + 14.
     rows, columns = (set(places.tolist()) for places in np.nonzero(seen))

@@ -11,6 +11,7 @@ from jaxil import methods
 from jaxil.learner.rewarder import AgentView
 from jaxil.maths.types import Batch, ExpertBatch, Window
 from jaxil.networks.agent import critic_features
+from jaxil.networks.discriminator import PatchDiscriminator
 from tests.tiny_agent import (
     NETWORKS,
     SIDE,
@@ -109,14 +110,14 @@ def test_expert_above_agent_after_learning(method):
     update = jax.jit(rewarder.update)
     # Each frame looks alike for both: only what follows what differs.
     dark, bright = (
-        random_frames(seed, BATCH, low=low, high=low + 60)
+        jnp.asarray(random_frames(seed, BATCH, low=low, high=low + 60))
         for seed, low in ((0, 0), (1, 190))
     )
     features = [
-        critic_features(NETWORKS, PARAMS.encoder, PARAMS.critic, jnp.asarray(x))
-        for x in (bright, dark)
+        critic_features(NETWORKS, PARAMS.encoder, PARAMS.critic, observation)
+        for observation in (bright, dark)
     ]
-    actions = random_actions(0, BATCH)
+    actions = jnp.asarray(random_actions(0, BATCH))
     poison = jnp.full((BATCH, SIDE, SIDE, 3), jnp.nan)
     view = AgentView(bright, features[0], actions, poison, dark, features[1])
     expert = ExpertBatch(dark, actions, bright)
@@ -134,6 +135,14 @@ def test_expert_above_agent_after_learning(method):
     frames = np.stack([dark, bright], axis=1).reshape(-1, SIDE, SIDE, 3)
     rewards = rewards_of(method, state, frames)
     assert rewards[0::2].min() > rewards[1::2].max()
+    if method == "patchail":
+        state, _ = update(first_state(method), PARAMS, view, expert, key)
+        both = jnp.concatenate([dark, bright], axis=-1) / 255.0  # not augmented
+        logits = PatchDiscriminator(width=2).apply(state.params, both)
+        expected = np.mean(jax.nn.sigmoid(jnp.asarray(logits)), axis=0)
+        expected /= expected.sum()
+        np.testing.assert_allclose(state.expert_patches, expected, rtol=1e-4)
+        assert np.ptp(expected) > 1e-3  # not as at the start
     other = expert._replace(observation=dark[:4])
     with pytest.raises(AssertionError):
         rewarder.update(state, PARAMS, view, other, jax.random.key(0))
