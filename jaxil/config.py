@@ -238,7 +238,12 @@ def problems(config: Config, known_tasks: tuple[str, ...]) -> list[Fault]:
         known = fields(config.method)
     except UsageError as error:
         return [*error.faults, *_problems(config, FIELDS, known_tasks)]  # pyright: ignore
-    return list(_problems(config, known, known_tasks))
+    faults = list(_problems(config, known, known_tasks))
+    method = methods.get(config.method)
+    if method.needs_pixels and config.observation == "state":
+        rule = f"has no image, which {method.label} judges"
+        faults.append(Fault("observation", rule, "use 'pixels'", "state"))
+    return faults
 
 
 def _problems(

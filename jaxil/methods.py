@@ -80,6 +80,7 @@ class Method(NamedTuple):
       plays: whether the agent acts in the environment; a method that does not learns
         from demonstrations alone, and its frames count updates.
       total_updates: length of a run of a method that does not play.
+      needs_pixels: whether it cannot learn from state vectors.
       metrics: columns of train.csv beside those of the learner.
       variations: fields that make ablations.
     """
@@ -96,6 +97,7 @@ class Method(NamedTuple):
     sees_actions: bool | str = False
     plays: bool = True
     total_updates: int = 0
+    needs_pixels: bool = False
     metrics: tuple[str, ...] = ()
     variations: tuple[Variation, ...] = ()
 
@@ -108,6 +110,16 @@ DISCRIMINATOR = {
         128, "expert samples, and agent samples, in an update; 128 in ROT", 1, 65_536
     ),
 }
+DISCRIMINATOR_METRICS = (
+    "discriminator/loss",
+    "discriminator/penalty",
+    "discriminator/expert_logit",
+    "discriminator/agent_logit",
+)
+RELABELS = Field(
+    True,
+    "rewards are recomputed for every batch; False: stored, see reward_refresh_steps",
+)
 SINKHORN = {
     "cost": Field("cosine", "between features", choices=("cosine", "euclidean")),
     "alignment": Field(

@@ -39,6 +39,9 @@ STATES = ("--config.observation=state", "--config.encoder.subtract_mean_image=Fa
 _OWN = {
     "pdac": ("discriminator.hidden_dim=16", "discriminator.batch_size=8"),
     "dac": ("discriminator.hidden_dim=16", "discriminator.batch_size=8"),
+    "patchail": ("discriminator.width=2", "discriminator.batch_size=8"),
+    "laifo": ("discriminator.hidden_dim=16", "discriminator.batch_size=8"),
+    "gaifo": ("discriminator.hidden_dim=16", "discriminator.batch_size=8"),
     "psil": ("sinkhorn.target_update_steps=150", "sinkhorn.num_iterations=10"),
     "sil": ("discriminator.batch_size=8", "sinkhorn.num_iterations=10"),
     "bc": ("cloning.batch_size=8",),

@@ -1,7 +1,9 @@
 """Discriminators between expert and agent: on features, or on pixels."""
 
+import math
 from typing import Any
 
+import chex
 import flax.linen as nn
 import jax.numpy as jnp
 from jax import Array
@@ -51,3 +53,42 @@ class PixelDiscriminator(nn.Module):
         features = Embedding(self.encoder, self.feature_dim)(observation)
         inputs = jnp.concatenate([features, action], axis=-1)
         return Discriminator(self.hidden_dim)(inputs)
+
+
+class TransitionDiscriminator(nn.Module):
+    """Discriminator of two observations in turn, each embedded by the same encoder."""
+
+    encoder: Any
+    feature_dim: int
+    hidden_dim: int
+
+    @nn.compact
+    def __call__(self, observation: Array, successor: Array) -> Array:
+        """Maps twice [B, H, W, C] to logits [B]."""
+        embed = Embedding(self.encoder, self.feature_dim)
+        features = [embed(observation), embed(successor)]
+        return Discriminator(self.hidden_dim)(jnp.concatenate(features, axis=-1))
+
+
+class PatchDiscriminator(nn.Module):
+    """Convolutions to one logit for each patch of 22x22 pixels, 2 pixels apart.
+
+    Attributes:
+      width: channels of the first layer; 32 in PatchAIL.
+
+    Source: sail-sg/PatchAIL, agent/discriminator.py.
+    """
+
+    width: int
+
+    @nn.compact
+    def __call__(self, pixels: Array) -> Array:
+        """Maps pixels in [0, 1], [B, H, W, C], to logits [B, P]."""
+        chex.assert_rank(pixels, 4)
+        x = pixels - 0.5
+        layers = (self.width, 2), (2 * self.width, 1), (4 * self.width, 1), (1, 1)
+        for number, (features, stride) in enumerate(layers):
+            x = nn.leaky_relu(x, 0.2) if number else x
+            gain = nn.initializers.orthogonal(math.sqrt(2.0))
+            x = nn.Conv(features, (4, 4), stride, padding=1, kernel_init=gain)(x)
+        return x.reshape(len(x), -1)

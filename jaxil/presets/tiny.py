@@ -23,9 +23,9 @@ from jaxil.errors import Fault, UsageError
 
 _ACTION_REPEATS = {"cartpole_swingup": 4}
 _GRADIENT_PENALTIES = {("pdac", "cartpole_swingup"): 1.0}
-# These two have a separate encoder, and DAC needs its second derivatives: with 64, an
-# update takes five times as long.
-_DISCRIMINATOR_BATCHES = {"dac": 16, "sil": 16}
+# These have a separate encoder, and penalties need its second derivatives: with 64, an
+# update of DAC takes five times as long.
+_DISCRIMINATOR_BATCHES = {"dac": 16, "sil": 16, "gaifo": 16, "patchail": 8}
 
 
 def get_config(argument: str = "pdac,cartpole_swingup"):
@@ -63,6 +63,8 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     if "hidden_dim" in own:
         own.hidden_dim = 256
         own.gradient_penalty = _GRADIENT_PENALTIES.get((method, task), 10.0)
+    if "width" in own:
+        own.width = 8
     if own:
         own.batch_size = _DISCRIMINATOR_BATCHES.get(method, 64)
         own.learning_rate = 3e-4

@@ -20,8 +20,12 @@ from jaxil.maths.types import (
 )
 from jaxil.networks.agent import apply
 from jaxil.networks.discriminator import PixelDiscriminator
-from jaxil.networks.encoder import PixelEncoder
-from jaxil.rewarders.discrimination import update_discriminator
+from jaxil.rewarders.discrimination import (
+    scaled,
+    separate_encoder,
+    unscaled,
+    update_discriminator,
+)
 
 METHOD = methods.Method(
     name="dac",
@@ -31,12 +35,7 @@ METHOD = methods.Method(
     rank=3,
     sections={"discriminator": methods.DISCRIMINATOR},
     sees_actions=True,
-    metrics=(
-        "discriminator/loss",
-        "discriminator/penalty",
-        "discriminator/expert_logit",
-        "discriminator/agent_logit",
-    ),
+    metrics=methods.DISCRIMINATOR_METRICS,
 )
 
 Inputs = tuple[Array, Array]  # pixels in [0, 1], float [B, H, W, C]; actions [B, A]
@@ -68,23 +67,14 @@ def make_rewarder(
     Source: Kostrikov et al. 2019, arXiv:1809.02925, on pixels as in Cohen et al. 2021,
     sec. 4.1.
     """
-    encoder = agent.networks.encoder
-    if isinstance(encoder, PixelEncoder):  # the penalty differentiates it twice
-        encoder = encoder.clone(native=False)
-    discriminator = PixelDiscriminator(encoder, agent.feature_dim, hidden_dim)
+    discriminator = PixelDiscriminator(
+        separate_encoder(agent), agent.feature_dim, hidden_dim
+    )
     optimiser = optax.adam(learning_rate)
-
-    def inputs(observation: Array, action: Array) -> Inputs:
-        observation = jnp.asarray(observation)
-        if observation.ndim == 4:
-            observation = observation.astype(jnp.float32) / 255.0
-        return observation, action
 
     def logits(params: Params, x: Inputs) -> Array:
         observation, action = x
-        if observation.ndim == 4:  # the encoder takes pixels as they are stored
-            observation = 255.0 * observation
-        return apply(discriminator, params, observation, action)
+        return apply(discriminator, params, unscaled(observation), action)
 
     def init(key: Array, spec: Spec, learner: LearnerParams) -> ModuleState:
         del learner
@@ -105,8 +95,8 @@ def make_rewarder(
         return update_discriminator(
             state,
             logits,
-            inputs(expert.observation, expert.action),
-            inputs(view.unshifted[:batch_size], view.action[:batch_size]),
+            (scaled(expert.observation), expert.action),
+            (scaled(view.unshifted[:batch_size]), view.action[:batch_size]),
             key,
             penalty_weight=gradient_penalty,
             optimiser=optimiser,
@@ -121,7 +111,7 @@ def make_rewarder(
             lambda x: jnp.reshape(x, (-1, *x.shape[2:])),
             (window.observation, window.action),
         )
-        flat = logits(state.params, inputs(observation, action))
+        flat = logits(state.params, (scaled(observation), action))
         return flat.reshape(window.action.shape[:2])
 
     def rewards(
@@ -135,7 +125,7 @@ def make_rewarder(
         observations = stacking.stack_frames(
             episode.frames, frame_stack=agent.frame_stack
         )
-        x = inputs(observations[:-1], jnp.asarray(episode.actions))
+        x = scaled(observations[:-1]), jnp.asarray(episode.actions)
         return logits(state.params, x)
 
     return Rewarder(

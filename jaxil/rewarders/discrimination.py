@@ -1,18 +1,36 @@
-"""One step of a discriminator, whatever it looks at."""
+"""What methods with a discriminator share: its step, and rewards of transitions."""
 
 from collections.abc import Callable
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
 
-from jaxil.learner.state import ModuleState, apply_gradients
-from jaxil.maths import losses
-from jaxil.maths.types import Metrics, Params
+from jaxil.learner.rewarder import AgentSpec, AgentView, Rewarder, RewarderState, Spec
+from jaxil.learner.state import (
+    LearnerParams,
+    ModuleState,
+    apply_gradients,
+    init_module,
+)
+from jaxil.maths import augmentation, losses, stacking
+from jaxil.maths.types import (
+    Batch,
+    Data,
+    Episode,
+    ExpertBatch,
+    ExpertEpisodes,
+    Metrics,
+    Params,
+)
+from jaxil.networks.encoder import PixelEncoder
 
-Logits = Callable[[Params, Any], Array]  # parameters and inputs to logits [B]
+# Parameters and inputs to logits: [B], or [B, P] of P parts of the input.
+Logits = Callable[[Params, Any], Array]
+Pair = tuple[Array, Array]  # of what is seen of o_t and of o_{t+1}
 
 
 def update_discriminator(
@@ -28,6 +46,9 @@ def update_discriminator(
     """Takes one step towards telling expert (label 1) from agent (label 0).
 
         max_D  mean log D(e) + mean log(1 - D(a)) - penalty_weight * GP
+
+    Where an input has logits of several parts, means are over these too, and the
+    penalty is on the mean logit.
 
     Args:
       state: the discriminator.
@@ -45,9 +66,11 @@ def update_discriminator(
     def loss(params: Params) -> tuple[Array, Metrics]:
         together = jax.tree.map(lambda *x: jnp.concatenate(x), expert, agent)
         expert_logits, agent_logits = jnp.split(logits(params, together), 2)
-        cross_entropy = losses.discriminator_loss(expert_logits, agent_logits)
+        cross_entropy = losses.discriminator_loss(
+            expert_logits.ravel(), agent_logits.ravel()
+        )
         penalty = losses.gradient_penalty(
-            lambda x: logits(params, x), expert, agent, key
+            lambda x: mean_logit(logits(params, x)), expert, agent, key
         )
         metrics = {
             "discriminator/loss": cross_entropy,
@@ -59,3 +82,129 @@ def update_discriminator(
 
     gradients, metrics = jax.grad(loss, has_aux=True)(state.params)
     return apply_gradients(state, gradients, optimiser), metrics
+
+
+def mean_logit(logits: Array) -> Array:
+    """Returns the mean over all axes but the first."""
+    return jnp.mean(logits, axis=tuple(range(1, logits.ndim)))
+
+
+def scaled(observation: Data) -> Array:
+    """Returns pixels in [0, 1], for which penalties are meant; states as they are."""
+    observation = jnp.asarray(observation)
+    if observation.ndim == 2:
+        return observation
+    return observation.astype(jnp.float32) / 255.0
+
+
+def unscaled(x: Array) -> Array:
+    """Returns what encoders take for what `scaled` returned."""
+    return x if x.ndim == 2 else 255.0 * x
+
+
+def separate_encoder(agent: AgentSpec) -> Any:
+    """Returns an encoder like the agent's that a penalty may differentiate twice."""
+    encoder = agent.networks.encoder
+    return encoder.clone(native=False) if isinstance(encoder, PixelEncoder) else encoder
+
+
+def make_transition_rewarder(
+    agent: AgentSpec,
+    *,
+    init_params: Callable[[Array, Spec], Params],
+    see: Callable[[LearnerParams, Array], Array],
+    seen: Callable[[AgentView], tuple[Array | None, Array | None]],
+    logits: Logits,
+    reward: Callable[[RewarderState, Array], Array],
+    learning_rate: float,
+    gradient_penalty: float,
+    batch_size: int,
+    relabels: bool,
+) -> Rewarder:
+    """Returns the rewarder of a discriminator of transitions.
+
+        r_t = reward(logits D(x_t, x_{t+1}))
+
+    with what is seen of an observation, x = see(o). D is trained on augmented
+    observations; what it rewards is not augmented.
+
+    Args:
+      agent: of the run.
+      init_params: (key, spec) -> parameters of D.
+      see: (learner, observations [M, ...]) -> x [M, ...].
+      seen: (view) -> the agent's x_t and x_{t+1}, [B, ...].
+      logits: (parameters, (x_t, x_{t+1})) -> logits [M], or [M, P].
+      reward: (state, logits) -> rewards [M]; the state has D's parameters.
+      learning_rate: of D's Adam.
+      gradient_penalty: its weight.
+      batch_size: expert samples, and agent samples, in an update.
+      relabels: whether rewards are those of now in every batch; otherwise they are
+        stored.
+    """
+    optimiser = optax.adam(learning_rate)
+
+    def init(key: Array, spec: Spec, learner: LearnerParams) -> ModuleState:
+        del learner
+        return init_module(init_params(key, spec), optimiser)
+
+    def update(
+        state: ModuleState,
+        learner: LearnerParams,
+        view: AgentView,
+        expert: ExpertBatch | None,
+        key: Array,
+    ) -> tuple[ModuleState, Metrics]:
+        assert expert is not None
+        assert expert.successor is not None
+        chex.assert_axis_dimension(expert.observation, 0, batch_size)
+        chex.assert_equal_shape([expert.observation, expert.successor])
+        *keys, penalty_key = jax.random.split(key, 3)
+        pairs = zip((expert.observation, expert.successor), keys, strict=True)
+        return update_discriminator(
+            state,
+            logits,
+            tuple(
+                see(learner, augmentation.augment(o, k, padding=agent.shift_padding))
+                for o, k in pairs
+            ),
+            jax.tree.map(lambda x: x[:batch_size], seen(view)),
+            penalty_key,
+            penalty_weight=gradient_penalty,
+            optimiser=optimiser,
+        )
+
+    def rewards(
+        state: ModuleState,
+        learner: LearnerParams,
+        episode: Episode,
+        expert_episodes: ExpertEpisodes | None,
+    ) -> Array:
+        del expert_episodes
+        x = see(
+            learner,
+            stacking.stack_frames(episode.frames, frame_stack=agent.frame_stack),
+        )
+        return reward(state, logits(state.params, (x[:-1], x[1:])))
+
+    def relabel(state: ModuleState, learner: LearnerParams, batch: Batch) -> Array:
+        window = batch.window
+        assert window is not None
+        chex.assert_equal_shape_prefix([window.observation, window.action], 2)
+        moments = [window.observation, batch.next_observation[:, None]]
+        moments = jnp.concatenate(moments, axis=1)  # [B, n + 1, ...]
+        batch_size, count = moments.shape[:2]
+        x = see(learner, moments.reshape(-1, *moments.shape[2:]))
+        x = x.reshape(batch_size, count, *x.shape[1:])
+        pair = (y.reshape(-1, *y.shape[2:]) for y in (x[:, :-1], x[:, 1:]))
+        judged = reward(state, logits(state.params, tuple(pair)))
+        return judged.reshape(batch_size, count - 1)
+
+    return Rewarder(
+        rewards,
+        init,
+        update,
+        expert_batch_size=batch_size,
+        samples_successors=True,
+        relabel=relabel if relabels else None,
+        rewards_changed=None if relabels else lambda state: True,
+    )

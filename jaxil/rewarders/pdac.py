@@ -28,12 +28,7 @@ METHOD = methods.Method(
         }
     },
     sees_actions="discriminator.sees_actions",
-    metrics=(
-        "discriminator/loss",
-        "discriminator/penalty",
-        "discriminator/expert_logit",
-        "discriminator/agent_logit",
-    ),
+    metrics=methods.DISCRIMINATOR_METRICS,
     variations=(methods.Variation("discriminator.sees_actions", False, "actions"),),
 )
 

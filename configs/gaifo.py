@@ -1,0 +1,11 @@
+r"""GAIfO/DACfO on the paper's backbone, on any task.
+
+python -m jaxil.launch --config=configs/gaifo.py:cheetah_run --workdir=runs/gaifo
+"""
+
+from jaxil import config as jaxil_config
+
+
+def get_config(task: str = "walker_walk"):
+    """Returns the settings for `task`."""
+    return jaxil_config.default_config("gaifo", task)

@@ -1,0 +1,79 @@
+"""GAIfO with DAC's learner: a discriminator of transitions with a separate encoder."""
+
+import jax.numpy as jnp
+from jax import Array
+
+from jaxil import methods
+from jaxil.learner.rewarder import AgentSpec, Rewarder, Spec
+from jaxil.maths.types import Params
+from jaxil.networks.agent import apply
+from jaxil.networks.discriminator import TransitionDiscriminator
+from jaxil.rewarders.discrimination import (
+    Pair,
+    make_transition_rewarder,
+    scaled,
+    separate_encoder,
+    unscaled,
+)
+
+METHOD = methods.Method(
+    name="gaifo",
+    label="GAIfO/DACfO",
+    about="adversarial rewards on transitions of pixels",
+    colour="#44AA99",
+    rank=12,
+    sections={"discriminator": {**methods.DISCRIMINATOR, "relabels": methods.RELABELS}},
+    metrics=methods.DISCRIMINATOR_METRICS,
+    variations=(methods.Variation("discriminator.relabels", True, "stored rewards"),),
+)
+
+
+def make_rewarder(
+    agent: AgentSpec,
+    *,
+    hidden_dim: int,
+    learning_rate: float,
+    gradient_penalty: float,
+    batch_size: int,
+    relabels: bool,
+) -> Rewarder:
+    """Returns the rewarder of GAIfO, extended to pixels as DAC is.
+
+        r_t = logit D(o_t, o_{t+1})
+
+    It differs from DAC in that D judges the next observation instead of the action, and
+    is trained on augmented pixels; `shift_padding=0` leaves them as they are. Its
+    gradient penalty is on both observations.
+
+    Args:
+      agent: the discriminator's encoder is made like its own.
+      hidden_dim: width of the discriminator.
+      learning_rate: this and the others: see `make_transition_rewarder`.
+
+    Source: Torabi et al. 2018, Generative Adversarial Imitation from Observation,
+    arXiv:1807.06158; off policy as in Kostrikov et al. 2019, arXiv:1809.02925;
+    augmented as PatchAIL's baseline with an independent encoder is.
+    """
+    discriminator = TransitionDiscriminator(
+        separate_encoder(agent), agent.feature_dim, hidden_dim
+    )
+
+    def init_params(key: Array, spec: Spec) -> Params:
+        observation = jnp.zeros((1, *spec.observation_shape))
+        return discriminator.init(key, observation, observation)
+
+    def logits(params: Params, pair: Pair) -> Array:
+        return apply(discriminator, params, *map(unscaled, pair))
+
+    return make_transition_rewarder(
+        agent,
+        init_params=init_params,
+        see=lambda learner, observation: scaled(observation),
+        seen=lambda view: (scaled(view.observation), scaled(view.successor)),
+        logits=logits,
+        reward=lambda state, logits: logits,
+        learning_rate=learning_rate,
+        gradient_penalty=gradient_penalty,
+        batch_size=batch_size,
+        relabels=relabels,
+    )

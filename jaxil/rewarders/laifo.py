@@ -1,0 +1,100 @@
+"""LAIfO: rewards from a discriminator of transitions between the critic's features."""
+
+import jax.numpy as jnp
+from jax import Array
+
+from jaxil import methods
+from jaxil.learner.rewarder import AgentSpec, Rewarder, RewarderState, Spec
+from jaxil.learner.state import LearnerParams
+from jaxil.maths.types import Params
+from jaxil.networks.agent import apply, critic_features
+from jaxil.networks.discriminator import Discriminator
+from jaxil.rewarders.discrimination import Pair, make_transition_rewarder
+
+METHOD = methods.Method(
+    name="laifo",
+    label="LAIfO",
+    about="adversarial rewards on transitions of the critic's features",
+    colour="#332288",
+    rank=11,
+    sections={
+        "discriminator": {
+            **methods.DISCRIMINATOR,
+            "learning_rate": methods.Field(
+                4e-4, "of its Adam; 4e-4 in the paper", 0, 1, positive=True
+            ),
+            "reward": methods.Field(
+                "decision",
+                "decision: 1 where it takes the agent for the expert, else 0, as in "
+                "the authors' code; logit: as in P-DAC",
+                choices=("decision", "logit"),
+            ),
+            "relabels": methods.RELABELS,
+        }
+    },
+    metrics=methods.DISCRIMINATOR_METRICS,
+    variations=(
+        methods.Variation("discriminator.reward", "decision", "{}"),
+        methods.Variation("discriminator.relabels", True, "stored rewards"),
+    ),
+)
+
+
+def make_rewarder(
+    agent: AgentSpec,
+    *,
+    hidden_dim: int,
+    learning_rate: float,
+    gradient_penalty: float,
+    batch_size: int,
+    reward: str,
+    relabels: bool,
+) -> Rewarder:
+    """Returns the rewarder of LAIfO.
+
+        r_t = 1 if logit D(z_t, z_{t+1}) > 0 else 0
+
+    with critic-trunk features z, without gradient into encoder or trunk.
+
+    Args:
+      agent: only its encoder and the critic's trunk are used.
+      hidden_dim: width of the discriminator.
+      learning_rate: this and those that are not named here: see
+        `make_transition_rewarder`.
+      reward: "decision", the equation above, or "logit", the logit itself.
+
+    Source: Giammarino et al. 2024, Adversarial Imitation Learning from Visual
+    Observations using Latent Information, arXiv:2309.17371, and its code,
+    VittorioGiammarino/AIL_from_visual_obs. There, actor and critic share one trunk,
+    and one transition over n steps is judged where returns are of n steps; here each
+    of its steps is.
+    """
+    discriminator = Discriminator(hidden_dim)
+
+    def init_params(key: Array, spec: Spec) -> Params:
+        return discriminator.init(key, jnp.zeros((1, 2 * spec.feature_dim)))
+
+    def see(learner: LearnerParams, observation: Array) -> Array:
+        return critic_features(
+            agent.networks, learner.encoder, learner.critic, observation
+        )
+
+    def logits(params: Params, pair: Pair) -> Array:
+        return apply(discriminator, params, jnp.concatenate(pair, axis=-1))
+
+    def rewarded(state: RewarderState, logits: Array) -> Array:
+        del state
+        return logits if reward == "logit" else (logits > 0.0).astype(logits.dtype)
+
+    return make_transition_rewarder(
+        agent,
+        init_params=init_params,
+        see=see,
+        seen=lambda view: (view.features, view.successor_features),
+        logits=logits,
+        reward=rewarded,
+        learning_rate=learning_rate,
+        gradient_penalty=gradient_penalty,
+        batch_size=batch_size,
+        relabels=relabels,
+    )

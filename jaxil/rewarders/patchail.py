@@ -1,0 +1,204 @@
+"""PatchAIL: rewards from a discriminator of patches of pixels."""
+
+import chex
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxil import methods
+from jaxil.learner.rewarder import AgentSpec, AgentView, Rewarder, Spec
+from jaxil.learner.state import LearnerParams, ModuleState
+from jaxil.maths import stacking
+from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes, Metrics, Params
+from jaxil.networks.agent import apply
+from jaxil.networks.discriminator import PatchDiscriminator
+from jaxil.rewarders.discrimination import (
+    Pair,
+    make_transition_rewarder,
+    mean_logit,
+    scaled,
+)
+
+METHOD = methods.Method(
+    name="patchail",
+    label="PatchAIL",
+    about="adversarial rewards on patches of pixels",
+    colour="#117733",
+    rank=10,
+    sections={
+        "discriminator": {
+            "variant": methods.Field(
+                "plain",
+                "plain: the mean logit of all patches; weighted (PatchAIL-W), bonus "
+                "(PatchAIL-B): with their similarity to the expert's",
+                choices=("plain", "weighted", "bonus"),
+            ),
+            "width": methods.Field(
+                32,
+                "channels of its first layer; the next have 2 and 4 times as many; 32 "
+                "in the paper",
+                1,
+                10_000,
+            ),
+            "learning_rate": methods.DISCRIMINATOR["learning_rate"],
+            "gradient_penalty": methods.DISCRIMINATOR["gradient_penalty"],
+            "batch_size": methods.DISCRIMINATOR["batch_size"],
+            "relabels": methods.RELABELS._replace(default=False),
+        }
+    },
+    needs_pixels=True,
+    metrics=methods.DISCRIMINATOR_METRICS,
+    variations=(
+        methods.Variation("discriminator.variant", "plain", "{}"),
+        methods.Variation("discriminator.relabels", False, "relabelled rewards"),
+    ),
+)
+
+_FIRST_SIMILARITY = {"weighted": 1.3, "bonus": 0.5}
+
+
+class SimilarityState(ModuleState):
+    """The discriminator, and what similarity is measured with.
+
+    Attributes:
+      expert_patches: probabilities of the expert's patches, summing to one, in the mean
+        over the last update's samples. Shape [P].
+      scale: lambda, set by the first episode; 0 before. Shape [].
+    """
+
+    expert_patches: Array
+    scale: Array
+
+
+def make_rewarder(
+    agent: AgentSpec,
+    *,
+    variant: str,
+    width: int,
+    learning_rate: float,
+    gradient_penalty: float,
+    batch_size: int,
+    relabels: bool,
+) -> Rewarder:
+    """Returns the rewarder of PatchAIL, PatchAIL-W or PatchAIL-B.
+
+        plain      r_t = m_t,    m_t = mean over patches of logit D(o_t, o_{t+1})
+        weighted   r_t = s_t m_t
+        bonus      r_t = 0.5 m_t + s_t
+
+    with s_t = lambda `patch_similarity`, where lambda makes the first episode's mean s
+    1.3 (weighted) or 0.5 (bonus). The penalty is on the mean logit.
+
+    Args:
+      agent: of the run.
+      variant: one of these names.
+      width: see `PatchDiscriminator`.
+      learning_rate: this and the others: see `make_transition_rewarder`.
+
+    Source: Liu et al. 2023, Visual Imitation Learning with Patch Rewards,
+    arXiv:2302.00965, and its code, sail-sg/PatchAIL, where lambda is set by the first
+    batch, and s is that of the agent step's batch also where the logits are stored.
+    """
+    discriminator = PatchDiscriminator(width)
+
+    def init_params(key: Array, spec: Spec) -> Params:
+        *size, channels = spec.observation_shape
+        return discriminator.init(key, jnp.zeros((1, *size, 2 * channels)))
+
+    def logits(params: Params, pair: Pair) -> Array:
+        return apply(discriminator, params, jnp.concatenate(pair, axis=-1))
+
+    def similarity(state: SimilarityState, logits: Array) -> Array:
+        return patch_similarity(logits, state.expert_patches)
+
+    def reward(state: SimilarityState, logits: Array) -> Array:
+        mean = mean_logit(logits)
+        if variant == "plain":
+            return mean
+        s = state.scale * similarity(state, logits)
+        return s * mean if variant == "weighted" else 0.5 * mean + s
+
+    plain = make_transition_rewarder(
+        agent,
+        init_params=init_params,
+        see=lambda learner, observation: scaled(observation),
+        seen=lambda view: (scaled(view.observation), scaled(view.successor)),
+        logits=logits,
+        reward=reward,
+        learning_rate=learning_rate,
+        gradient_penalty=gradient_penalty,
+        batch_size=batch_size,
+        relabels=relabels,
+    )
+    if variant == "plain":
+        return plain
+
+    def init(key: Array, spec: Spec, learner: LearnerParams) -> SimilarityState:
+        state = plain.init(key, spec, learner)
+        pixels = jnp.zeros((1, *spec.observation_shape))
+        patches = jax.eval_shape(logits, state.params, (pixels, pixels)).shape[1]
+        return SimilarityState(
+            params=state.params,
+            opt_state=state.opt_state,
+            expert_patches=jnp.full(patches, 1.0 / patches),
+            scale=jnp.zeros(()),
+        )
+
+    def update(
+        state: SimilarityState,
+        learner: LearnerParams,
+        view: AgentView,
+        expert: ExpertBatch | None,
+        key: Array,
+    ) -> tuple[SimilarityState, Metrics]:
+        new, metrics = plain.update(state, learner, view, expert, key)
+        assert expert is not None
+        pair = scaled(expert.observation), scaled(expert.successor)
+        probabilities = jnp.mean(jax.nn.sigmoid(logits(new.params, pair)), axis=0)
+        return state.replace(
+            params=new.params,
+            opt_state=new.opt_state,
+            expert_patches=probabilities / jnp.sum(probabilities),
+        ), metrics
+
+    def observe(
+        state: SimilarityState,
+        learner: LearnerParams,
+        episode: Episode,
+        expert_episodes: ExpertEpisodes | None,
+    ) -> SimilarityState:
+        del learner, expert_episodes
+
+        def first_scale() -> Array:
+            x = scaled(
+                stacking.stack_frames(episode.frames, frame_stack=agent.frame_stack)
+            )
+            found = similarity(state, logits(state.params, (x[:-1], x[1:])))
+            return _FIRST_SIMILARITY[variant] / jnp.mean(found)
+
+        scale = jax.lax.cond(state.scale > 0.0, lambda: state.scale, first_scale)
+        return state.replace(scale=scale)
+
+    return plain._replace(init=init, update=update, observe=observe)
+
+
+def patch_similarity(logits: Array, expert_patches: Array) -> Array:
+    """Returns how much like the expert's the distribution over patches is.
+
+        exp(-KL(p | q)),    p = D / sum over patches of D,    D = sigmoid(logits)
+
+    Args:
+      logits: of one discriminator. Shape [B, P].
+      expert_patches: q, positive and summing to one. Shape [P].
+
+    Returns:
+      Similarities in (0, 1]. Shape [B].
+
+    Source: Liu et al. 2023, eq. (7), as in sail-sg/PatchAIL, agent/adv_irl.py.
+    """
+    chex.assert_rank([logits, expert_patches], [2, 1])
+    chex.assert_equal_shape_suffix([logits, expert_patches], 1)
+    log_d = jax.nn.log_sigmoid(logits)
+    log_p = log_d - jax.nn.logsumexp(log_d, axis=1, keepdims=True)
+    divergence = jnp.exp(log_p) * (log_p - jnp.log(expert_patches)[None])
+    return jnp.exp(-jnp.sum(divergence, axis=1))
