@@ -192,12 +192,12 @@ def make_transition_rewarder(
         chex.assert_equal_shape_prefix([window.observation, window.action], 2)
         moments = [window.observation, batch.next_observation[:, None]]
         moments = jnp.concatenate(moments, axis=1)  # [B, n + 1, ...]
-        batch_size, count = moments.shape[:2]
+        size = moments.shape[:2]
         x = see(learner, moments.reshape(-1, *moments.shape[2:]))
-        x = x.reshape(batch_size, count, *x.shape[1:])
+        x = x.reshape(*size, *x.shape[1:])
         pair = (y.reshape(-1, *y.shape[2:]) for y in (x[:, :-1], x[:, 1:]))
         judged = reward(state, logits(state.params, tuple(pair)))
-        return judged.reshape(batch_size, count - 1)
+        return judged.reshape(window.action.shape[:2])
 
     return Rewarder(
         rewards,

@@ -163,8 +163,8 @@ def test_one_episode_is_in_memory_at_a_time(tmp_path):
         )
     # As compressed, as unpacked, as an array, and of single frames.
     with bounded(num_bytes=4 * num_bytes):
-        for _ in foreign.open_recording(tmp_path, max_bytes=2 * num_bytes).episodes:
-            pass
+        recording = foreign.open_recording(tmp_path, max_bytes=2 * num_bytes)
+        assert [len(each.frames) for each in recording.episodes] == [40] * 5
 
 
 # --- what is refused ------------------------------------------------------------------
