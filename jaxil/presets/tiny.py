@@ -63,6 +63,8 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     if "hidden_dim" in own:
         own.hidden_dim = 256
         own.gradient_penalty = _GRADIENT_PENALTIES.get((method, task), 10.0)
+    if "num_components" in own:
+        own.num_components = 32
     if "width" in own:
         own.width = 8
     if own:

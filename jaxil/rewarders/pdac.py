@@ -1,4 +1,6 @@
-"""P-DAC: rewards from a discriminator on the critic's own features."""
+"""P-DAC: rewards from a discriminator on the critic's features, or a code of pixels."""
+
+import functools
 
 import chex
 import jax
@@ -13,6 +15,9 @@ from jaxil.maths import augmentation, stacking
 from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes, Metrics, Params
 from jaxil.networks.agent import apply, critic_features
 from jaxil.networks.discriminator import Discriminator
+from jaxil.networks.encoder import PixelEncoder
+from jaxil.rewarders import codes
+from jaxil.rewarders.codes import FrameCode
 from jaxil.rewarders.discrimination import update_discriminator
 
 METHOD = methods.Method(
@@ -25,12 +30,26 @@ METHOD = methods.Method(
         "discriminator": {
             **methods.DISCRIMINATOR,
             "sees_actions": methods.Field(False, "appends actions to the features"),
+            "num_components": methods.NUM_COMPONENTS,
         }
     },
     sees_actions="discriminator.sees_actions",
     metrics=methods.DISCRIMINATOR_METRICS,
-    variations=(methods.Variation("discriminator.sees_actions", False, "actions"),),
+    variations=(
+        methods.Variation("discriminator.sees_actions", False, "actions"),
+        methods.Variation("discriminator.num_components", 0, "{} components"),
+    ),
 )
+
+
+class JudgeState(ModuleState):
+    """The discriminator, and the code of pixels if it judges that.
+
+    Attributes:
+      code: None where it judges the critic's features.
+    """
+
+    code: FrameCode | None
 
 
 def make_rewarder(
@@ -41,6 +60,7 @@ def make_rewarder(
     gradient_penalty: float,
     batch_size: int,
     sees_actions: bool,
+    num_components: int,
 ) -> Rewarder:
     """Returns the rewarder of P-DAC.
 
@@ -50,6 +70,10 @@ def make_rewarder(
     observations, without gradient into encoder or trunk. log D - log(1 - D), the
     paper's reward, is the logit itself, and only the logit stays finite in float32.
 
+    With `num_components`, e is `codes.encode` of observations without augmentation. It
+    does not change, so what a reward means does not either, and it knows of the whole
+    image from the start; the critic's features know of what rewards have taught.
+
     Args:
       agent: only its encoder and the critic's trunk are used.
       hidden_dim: width of the discriminator.
@@ -57,12 +81,17 @@ def make_rewarder(
       gradient_penalty: its weight.
       batch_size: expert samples, and agent samples, in an update.
       sees_actions: whether actions are appended to the features: D(o_t, a_t).
+      num_components: of each frame; 0, the paper's: the critic's features. State
+        vectors have no code, and their features are judged.
 
     Source: Cohen et al. 2021, sec. 3.2; sizes and rates, which the paper leaves
-    out, from siddhanthaldar/ROT.
+    out, from siddhanthaldar/ROT. The code is this project's own.
     """
     discriminator = Discriminator(hidden_dim)
     optimiser = optax.adam(learning_rate)
+    if not isinstance(agent.networks.encoder, PixelEncoder):
+        num_components = 0
+    encode = functools.partial(codes.encode, frame_stack=agent.frame_stack)
 
     def inputs(features: Array, action: Array) -> Array:
         if not sees_actions:
@@ -72,59 +101,95 @@ def make_rewarder(
     def logits(params: Params, x: Array) -> Array:
         return apply(discriminator, params, x)
 
-    def init(key: Array, spec: Spec, learner: LearnerParams) -> ModuleState:
+    def init(key: Array, spec: Spec, learner: LearnerParams) -> JudgeState:
         del learner
-        width = spec.feature_dim + (spec.action_dim if sees_actions else 0)
+        code, width = None, spec.feature_dim
+        if num_components:
+            code = codes.init_code(
+                spec.observation_shape,
+                num_components=num_components,
+                frame_stack=agent.frame_stack,
+            )
+            width = num_components * agent.frame_stack
+        width += spec.action_dim if sees_actions else 0
         params = discriminator.init(key, jnp.zeros((1, width)))
-        return init_module(params, optimiser)
+        return JudgeState(**vars(init_module(params, optimiser)), code=code)
+
+    def observe(
+        state: JudgeState,
+        learner: LearnerParams,
+        episode: Episode,
+        expert_episodes: ExpertEpisodes | None,
+    ) -> JudgeState:
+        del learner
+        if state.code is None:
+            return state
+        assert expert_episodes is not None
+        return state.replace(code=codes.observe(state.code, episode, expert_episodes))
 
     def update(
-        state: ModuleState,
+        state: JudgeState,
         learner: LearnerParams,
         view: AgentView,
         expert: ExpertBatch | None,
         key: Array,
-    ) -> tuple[ModuleState, Metrics]:
+    ) -> tuple[JudgeState, Metrics]:
         assert expert is not None
         chex.assert_axis_dimension(expert.observation, 0, batch_size)
         shift_key, penalty_key = jax.random.split(key)
-        observation = augmentation.augment(
-            expert.observation, shift_key, padding=agent.shift_padding
-        )
-        features = critic_features(
-            agent.networks, learner.encoder, learner.critic, observation
-        )
-        return update_discriminator(
+        code = state.code
+        if code is None:
+            observation = augmentation.augment(
+                expert.observation, shift_key, padding=agent.shift_padding
+            )
+            expert_features = critic_features(
+                agent.networks, learner.encoder, learner.critic, observation
+            )
+            features = view.features[:batch_size]
+        else:
+            # Not augmented: a shift would move the code, and the code is all there is.
+            expert_features = encode(code, jnp.asarray(expert.observation))
+            features = encode(code, view.unshifted[:batch_size])
+            code = code.replace(is_fixed=jnp.ones((), bool))
+        module, metrics = update_discriminator(
             state,
             logits,
-            inputs(features, expert.action),
-            inputs(view.features[:batch_size], view.action[:batch_size]),
+            inputs(expert_features, expert.action),
+            inputs(features, view.action[:batch_size]),
             penalty_key,
             penalty_weight=gradient_penalty,
             optimiser=optimiser,
         )
+        return JudgeState(module.params, module.opt_state, code), metrics
+
+    def features_of(state: JudgeState, learner: LearnerParams, frames: Array) -> Array:
+        if state.code is not None:
+            return codes.encode_episode(
+                state.code, frames, frame_stack=agent.frame_stack
+            )
+        observations = stacking.stack_frames(frames, frame_stack=agent.frame_stack)
+        return critic_features(
+            agent.networks, learner.encoder, learner.critic, observations
+        )
 
     def rewards(
-        state: ModuleState,
+        state: JudgeState,
         learner: LearnerParams,
         episode: Episode,
         expert_episodes: ExpertEpisodes | None,
     ) -> Array:
         del expert_episodes
-        observations = stacking.stack_frames(
-            episode.frames, frame_stack=agent.frame_stack
-        )
+        features = features_of(state, learner, episode.frames)
         # r(o_{t+1}), as in the reference; with actions the pair is (o_t, a_t).
-        judged = observations[:-1] if sees_actions else observations[1:]
-        features = critic_features(
-            agent.networks, learner.encoder, learner.critic, judged
-        )
-        return logits(state.params, inputs(features, episode.actions))
+        judged = features[:-1] if sees_actions else features[1:]
+        return logits(state.params, inputs(judged, episode.actions))
 
     return Rewarder(
         rewards,
         init,
         update,
+        observe,
         expert_batch_size=batch_size,
+        matches_episodes=bool(num_components),
         rewards_changed=lambda state: True,
     )

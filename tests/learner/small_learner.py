@@ -42,6 +42,7 @@ PDAC = pdac.make_rewarder(
     gradient_penalty=10.0,
     batch_size=4,
     sees_actions=False,
+    num_components=0,
 )
 PSIL = psil.make_rewarder(
     AGENT,

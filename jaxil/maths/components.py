@@ -1,0 +1,44 @@
+"""Principal components of rows that arrive in parts."""
+
+import chex
+import jax.numpy as jnp
+from jax import Array, lax
+
+_TINY = 1e-12  # keeps directions without variance at zero instead of NaN
+
+
+def merge(sketch: Array, rows: Array) -> Array:
+    """Adds rows to a sketch of those before them.
+
+        S'^T S' = the best approximation of rank K of S^T S + X^T X
+
+    With U and L^2 the first K eigenvectors and eigenvalues of [S; X] [S; X]^T, which
+    is small where rows are few and long, S' = U^T [S; X] = L V^T. It is exact while all
+    rows so far have at most rank K.
+
+    Args:
+      sketch: S, from the rows before; zeros at first. Shape [K, P].
+      rows: X, less their mean. Shape [M, P].
+
+    Returns:
+      S': principal directions, the largest first, each as long as the root of the
+      rows' sum of squares along it. Shape [K, P].
+
+    Source: merge-and-truncate, Ross et al. 2008, Incremental learning for robust
+    visual tracking, sec. 3.1, with a fixed mean.
+    """
+    chex.assert_rank([sketch, rows], 2)
+    chex.assert_equal_shape_suffix([sketch, rows], 1)
+    together = jnp.concatenate([sketch, rows])
+    gram = jnp.matmul(together, together.T, precision=lax.Precision.HIGHEST)
+    _, vectors = jnp.linalg.eigh(gram)  # smallest first
+    largest = vectors[:, ::-1][:, : len(sketch)]
+    return jnp.matmul(largest.T, together, precision=lax.Precision.HIGHEST)
+
+
+def project(rows: Array, sketch: Array) -> Array:
+    """Returns coordinates along a sketch's directions: [M, P], [K, P] to [M, K]."""
+    chex.assert_rank([rows, sketch], 2)
+    chex.assert_equal_shape_suffix([rows, sketch], 1)
+    lengths = jnp.linalg.norm(sketch, axis=1, keepdims=True)
+    return rows @ (sketch / jnp.maximum(lengths, _TINY)).T

@@ -1,0 +1,119 @@
+"""A code of frames that needs no training: their principal components."""
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from jaxil.maths import components, stacking
+from jaxil.maths.types import Episode, ExpertEpisodes
+
+# With the usual four episodes before the first update, both weigh alike.
+_DEMONSTRATION_ROWS, _EPISODE_ROWS = 1024, 256
+_NORM = 8.0  # of an observation's code, root mean square: penalties depend on it
+_SMALLEST_SCALE = 1e-3  # below it is rounding, which must not be magnified
+
+
+class FrameCode(struct.PyTreeNode):
+    """Principal components of demonstrations and of play before the first update.
+
+    Fitted again by each episode until `is_fixed`. Both are needed: components of
+    demonstrations alone cannot tell where the agent is when it fails.
+
+    Attributes:
+      mean: of demonstrations' frames, in [0, 1]. Shape [P], with P = H W 3.
+      sketch: see `components.merge`. Shape [K, P].
+      num_rows: frames that it was fitted on. Shape [].
+      is_fixed: whether an update has used it. Shape [], bool.
+    """
+
+    mean: Array
+    sketch: Array
+    num_rows: Array
+    is_fixed: Array
+
+
+def init_code(
+    observation_shape: tuple[int, ...], *, num_components: int, frame_stack: int
+) -> FrameCode:
+    """Returns a code that has seen nothing, for observations [H, W, F * 3]."""
+    height, width, channels = observation_shape
+    size = height * width * channels // frame_stack
+    return FrameCode(
+        mean=jnp.zeros(size),
+        sketch=jnp.zeros((num_components, size)),
+        num_rows=jnp.zeros(()),
+        is_fixed=jnp.zeros((), bool),
+    )
+
+
+def observe(code: FrameCode, episode: Episode, experts: ExpertEpisodes) -> FrameCode:
+    """Returns the code fitted to one more episode, unless it is fixed."""
+    return jax.lax.cond(
+        code.is_fixed, lambda: code, lambda: _fit(code, episode, experts)
+    )
+
+
+def encode_frames(code: FrameCode, frames: Array) -> Array:
+    """Returns the codes of frames: [M, H, W, 3] to [M, K]."""
+    scale = jnp.sqrt(jnp.sum(code.sketch**2) / jnp.maximum(code.num_rows, 1.0))
+    codes = components.project(_rows(frames) - code.mean[None], code.sketch)
+    return codes * (_NORM / jnp.maximum(scale, _SMALLEST_SCALE))
+
+
+def encode(code: FrameCode, observation: Array, *, frame_stack: int) -> Array:
+    """Returns the codes of observations: [B, H, W, F * 3] to [B, F * K]."""
+    chex.assert_rank(observation, 4)
+    *size, channels = observation.shape
+    frames = observation.reshape(*size, frame_stack, channels // frame_stack)
+    frames = jnp.moveaxis(frames, 3, 1).reshape(-1, *size[1:], channels // frame_stack)
+    codes = encode_frames(code, frames).reshape(len(observation), -1)
+    return codes / jnp.sqrt(frame_stack)
+
+
+def encode_episode(code: FrameCode, frames: Array, *, frame_stack: int) -> Array:
+    """Returns `encode` of all observations of an episode, each frame encoded once.
+
+    Args:
+      code: fitted.
+      frames: shape [T + 1, H, W, 3].
+      frame_stack: F.
+
+    Returns:
+      Shape [T + 1, F * K].
+    """
+    codes = encode_frames(code, frames)
+    codes = stacking.stack_frames(codes, frame_stack=frame_stack)
+    return codes / jnp.sqrt(frame_stack)
+
+
+def _fit(code: FrameCode, episode: Episode, experts: ExpertEpisodes) -> FrameCode:
+    expert, play = _sample_demonstrations(experts), _sample_episode(episode.frames)
+    is_first = code.num_rows == 0.0
+    mean = jnp.where(is_first, jnp.mean(expert, axis=0), code.mean)
+    expert = jnp.where(is_first, expert - mean[None], 0.0)
+    rows = jnp.concatenate([expert, play - mean[None]])
+    return code.replace(
+        mean=mean,
+        sketch=components.merge(code.sketch, rows),
+        num_rows=code.num_rows + len(play) + jnp.where(is_first, len(expert), 0),
+    )
+
+
+def _sample_demonstrations(experts: ExpertEpisodes) -> Array:
+    """Returns frames evenly spaced over all demonstrations. Shape [M, P]."""
+    numbers = jnp.arange(_DEMONSTRATION_ROWS)
+    which = numbers % len(experts.num_frames)
+    share = numbers / _DEMONSTRATION_ROWS  # of the way through its demonstration
+    moment = jnp.floor(share * jnp.asarray(experts.num_frames)[which])
+    return _rows(jnp.asarray(experts.frames)[which, moment.astype(jnp.int32)])
+
+
+def _sample_episode(frames: Array) -> Array:
+    moments = jnp.linspace(0, len(frames) - 1, min(_EPISODE_ROWS, len(frames)))
+    return _rows(jnp.asarray(frames)[moments.astype(jnp.int32)])
+
+
+def _rows(frames: Array) -> Array:
+    return frames.reshape(len(frames), -1).astype(jnp.float32) / 255.0
