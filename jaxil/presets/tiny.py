@@ -13,6 +13,9 @@ shadows. Other deviations from the paper:
 - The replay is smaller, so that its rewards are newer, and they are recomputed
   (`reward_refresh_steps = 2_500`): those of the first episodes come from an untrained
   discriminator and would teach the critic that random behaviour is best.
+- P-DAC's discriminator judges 32 principal components of each frame instead of the
+  critic's features, which mislead it: `walker_stand` is learned with the first and not
+  with the second (launch/results/README.md, "Learning: the ladder").
 - cartpole_swingup repeats actions 4 times: with 2, a pole at 1 rad/s moves a quarter of
   a pixel between frames, which hides its speed, and agents only learned to spin it;
   with 8, none learned to balance it. P-DAC's gradient penalty has weight 1 there.

@@ -35,10 +35,7 @@ METHOD = methods.Method(
     },
     sees_actions="discriminator.sees_actions",
     metrics=methods.DISCRIMINATOR_METRICS,
-    variations=(
-        methods.Variation("discriminator.sees_actions", False, "actions"),
-        methods.Variation("discriminator.num_components", 0, "{} components"),
-    ),
+    variations=(methods.Variation("discriminator.sees_actions", False, "actions"),),
 )
 
 

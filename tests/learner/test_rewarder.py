@@ -33,6 +33,7 @@ SETTINGS = {
         "gradient_penalty": 10.0,
         "batch_size": 8,
         "sees_actions": True,
+        "num_components": 0,
     },
     "psil": {
         "cost": "cosine",
