@@ -4,6 +4,13 @@ import gc
 import os
 import signal
 
+# One core for each of xdist's processes, and for the programs that its tests start: three
+# times two threads on two cores get in each other's way, and take longer than one each.
+_worker = os.environ.get("PYTEST_XDIST_WORKER", "")
+if _worker and hasattr(os, "sched_setaffinity"):
+    _cores = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {_cores[int(_worker.removeprefix("gw")) % len(_cores)]})
+
 # Before jax and MuJoCo are imported anywhere: flags and GL are read only once.
 from jaxil.machine import startup
 

@@ -31,6 +31,7 @@ def main() -> dict[str, float]:
         task=config.task, num_episodes=1, action_repeat=20, image_size=24
     )
     agent = agents.make_agent(config, environment, demonstrations)
+    experts = agents.expert_episodes(agent.rewarder, demonstrations)
     replay = assembly.make_replay(config, environment)
     state, rng, metrics = agent.init_state(), np.random.default_rng(0), {}
     for number in range(NUM_EPISODES):
@@ -40,7 +41,9 @@ def main() -> dict[str, float]:
             num_episodes=1,
             first_episode=number,
         ).episodes
-        rewards = agent.rewards(state.rewarder, state.params, episode, None)
+        rewarder = agent.observe(state.rewarder, state.params, episode, experts)
+        rewards = agent.rewards(rewarder, state.params, episode, experts)
+        state = state.replace(rewarder=rewarder)
         replay.add_episode(**episode._replace(rewards=np.asarray(rewards))._asdict())
         for _ in range(NUM_UPDATES):
             batch = replay.sample(rng, config.batch_size)

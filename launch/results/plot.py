@@ -1,13 +1,17 @@
-r"""Plots learning.png from RUN/eval.csv, and cost.png from cost_*.json, all beside it.
+r"""Plots overview.png and learning.png from RUN/eval.csv, cost.png from cost_*.json.
 
     python -m jaxil.benchmark --config=configs/psil.py:cartpole_swingup \
         --sweep=batch_size:32,64,128,256 --json=launch/results/cost_batch_size.json
     python launch/results/plot.py
+
+All lie beside this file. The overview has a panel for each task and every run in it.
 """
 
 import collections
 import json
 import pathlib
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -15,6 +19,16 @@ from matplotlib.figure import Figure
 from jaxil.files.tables import read_csv
 
 _HERE = pathlib.Path(__file__).parent
+_TASKS = (
+    "ball_in_cup_catch",
+    "cartpole_swingup",
+    "finger_spin",
+    "walker_stand",
+    "walker_walk",
+    "cheetah_run",
+    "walker_run",
+    "acrobot_swingup",
+)
 _EPISODE_FRAMES = 1000
 _PRESET = "cartpole_swingup_pdac_repeat4_penalty1"
 # Field that was swept: x label, row of the benchmark, y label.
@@ -28,6 +42,79 @@ _PANELS = {
 }
 
 
+class Kind(NamedTuple):
+    """How the overview plots runs of one kind."""
+
+    label: str
+    colour: str
+    style: str = "-"
+    width: float = 1.0
+
+
+_KINDS = {
+    "components": Kind("P-DAC on components: the small preset", "#0072B2", width=2.2),
+    "features": Kind("P-DAC on the critic's features", "#56B4E9"),
+    "psil": Kind("P-SIL", "#D55E00", width=1.6),
+    "drqv2": Kind("true reward", "#009E73"),
+    "state": Kind("imitation from state vectors", "#999999", "--"),
+    "other": Kind("experiments and controls", "#cccccc"),
+}
+# Words in the names of runs that were made with changed code.
+_EXPERIMENTS = {"pca32", "pca64", "dynamics", "cloning1", "cloning3", "cloning10"}
+
+
+def kind_of(name: str, config: Mapping[str, Any]) -> str:
+    """Returns the kind of a run, by its folder and its settings."""
+    method = config["method"]
+    if _EXPERIMENTS & set(name.split("_")) or method in ("zero", "bc"):
+        return "other"
+    if config.get("observation", "pixels") == "state":
+        return "state"
+    if method in ("psil", "drqv2"):
+        return method
+    components = config.get("discriminator", {}).get("num_components", 0)
+    return "components" if components or "components" in name else "features"
+
+
+def plot_overview() -> None:
+    """Plots a panel for each task: every run, coloured by its kind."""
+    runs = collections.defaultdict(list)
+    for path in sorted(_HERE.glob("*/eval.csv")):
+        config = json.loads((path.parent / "config.json").read_text())["config"]
+        kind, table = kind_of(path.parent.name, config), read_csv(path)
+        if len(table["frame"]):  # some ended before an evaluation
+            runs[config["task"]].append((list(_KINDS).index(kind), kind, table))
+    panels = _axes(2, 4, width=3.0, height=2.5)
+    for axes, task in zip(panels, _TASKS):
+        for _, kind, table in sorted(runs[task], key=lambda run: -run[0]):
+            label, colour, style, width = _KINDS[kind]
+            x, y = table["frame"] / 1000, table["task_return_mean"]
+            axes.plot(x, y, style, color=colour, lw=width, label=label)
+        experts = [table["expert_task_return_mean"][-1] for *_, table in runs[task]]
+        if experts:
+            axes.axhline(max(experts), color="#222222", ls=":", lw=1.2, label="expert")
+        else:
+            words = {"ha": "center", "va": "center", "color": "#777777"}
+            axes.text(0.5, 0.5, "not tried yet", transform=axes.transAxes, **words)
+        axes.set_title(task, fontsize=9)
+        axes.set(xlim=(0, None), ylim=(0, 1050))
+        axes.tick_params(labelsize=7)
+    for axes in panels[4:]:
+        axes.set_xlabel("environment frames / 1000", fontsize=8)
+    for axes in panels[::4]:
+        axes.set_ylabel("task return", fontsize=8)
+    lines = {}
+    for axes in panels:
+        handles, labels = axes.get_legend_handles_labels()
+        lines.update(zip(labels, handles))
+    order = [kind.label for kind in _KINDS.values() if kind.label in lines]
+    order += ["expert"]
+    place = {"loc": "outside lower center", "ncols": 4, "frameon": False}
+    figure = panels[0].figure
+    figure.legend([lines[label] for label in order], order, fontsize=8, **place)
+    figure.savefig(_HERE / "overview.png")
+
+
 def plot_learning() -> None:
     """Plots one line for each run: a panel for each task, one for the preset."""
     panels = collections.defaultdict(list)
@@ -35,7 +122,8 @@ def plot_learning() -> None:
         name, config = path.parent.name, path.parent / "config.json"
         task = json.loads(config.read_text())["config"]["task"]
         title = f"{task}, P-DAC's preset" if _PRESET in name else task
-        panels[title].append((name.removeprefix(f"{task}_"), read_csv(path)))
+        if len((table := read_csv(path))["frame"]):
+            panels[title].append((name.removeprefix(f"{task}_"), table))
     grid = _axes(-(-len(panels) // 2), 2, width=5.2, height=5.2)
     for axes, (title, runs) in zip(grid, sorted(panels.items())):
         expert = max(table["expert_task_return_mean"][-1] for _, table in runs)
@@ -87,5 +175,6 @@ def _axes(rows: int, columns: int, *, width: float, height: float) -> list:
 
 
 if __name__ == "__main__":
+    plot_overview()
     plot_learning()
     plot_cost()
