@@ -4,16 +4,15 @@ import gc
 import os
 import signal
 
-# One core for each of xdist's processes, and for the programs that its tests start: three
-# times two threads on two cores get in each other's way, and take longer than one each.
+# Before jax and MuJoCo are imported anywhere: flags and GL are read only once.
+from jaxil.machine import startup
+
+# One core for each of xdist's processes and the programs that their tests start: with
+# two threads each, three processes on two cores get in each other's way.
 _worker = os.environ.get("PYTEST_XDIST_WORKER", "")
 if _worker and hasattr(os, "sched_setaffinity"):
     _cores = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {_cores[int(_worker.removeprefix("gw")) % len(_cores)]})
-
-# Before jax and MuJoCo are imported anywhere: flags and GL are read only once.
-from jaxil.machine import startup
-
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Tracing takes most of the time: a fifth of it goes into notes of where each operation
 # was written, and into searching for garbage among what is still used.
