@@ -29,13 +29,24 @@ if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
 
 import jax  # noqa: E402
 
-# Files whose tests mostly wait for other processes: begun first, they cost least.
-_WAITING = ("test_slurm.py", "test_sweep.py", "test_benchmark.py")
+# Files with the longest tests, those first that mostly wait for other processes.
+_LONGEST = (
+    "test_slurm.py",
+    "test_sweep.py",
+    "test_adoption.py",
+    "test_end_to_end.py",
+    "test_methods.py",
+    "test_own_tasks.py",
+    "test_benchmark.py",
+    "test_report.py",
+    "test_library.py",
+)
 
 
 def pytest_collection_modifyitems(items):
     """Puts the longest tests first, so that no process is left alone with them."""
-    items.sort(key=lambda item: item.path.name not in _WAITING)
+    places = {name: place for place, name in enumerate(_LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.name, len(places)))
 
 
 # [B] against [B, 1] is the classic silent error of reinforcement learning.
