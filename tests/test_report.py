@@ -110,6 +110,7 @@ def test_sample_efficiency(folder):
     assert float(row["reached_90"]) == pytest.approx(2 / 3)
     assert numbers(row, "frames_90", "hours_90") == [3000, 3]
     assert float(row["frames_per_second"]) == pytest.approx(1 / 3.6)
+    assert row["share_to_100k"] == ""  # none is as long
     (row,) = found["cartpole_swingup", "P-SIL"]
     assert numbers(row, "reached_50") == [0.5]
     assert row["frames_50"] == ""

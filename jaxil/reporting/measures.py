@@ -10,6 +10,7 @@ from jaxil.reporting.runs import Run, Table
 from jaxil.reporting.statistics import Estimate
 
 LEVELS = (0.5, 0.8, 0.9)  # of the expert's return
+EARLY_FRAMES = 100_000  # what methods that learn from video alone are compared by
 _MAX_POINTS = 400  # of a curve; a figure's width shows no more
 
 
@@ -101,3 +102,14 @@ def arrivals(run: Run, x: str) -> list[float]:
     position, returns = series(run.evaluation, x, "task_return_mean")
     levels = [share * run.expert_return for share in LEVELS]
     return [statistics.first_reaching(position, returns, level) for level in levels]
+
+
+def early_share(run: Run) -> float:
+    """Returns a run's mean share of the expert's return up to EARLY_FRAMES.
+
+    NaN if it is shorter, or without demonstrations.
+    """
+    frames, returns = series(run.evaluation, "frame", "task_return_mean")
+    if not run.expert_return > 0:
+        return float("nan")
+    return statistics.mean_until(frames, returns / run.expert_return, EARLY_FRAMES)

@@ -100,6 +100,28 @@ def first_reaching(x: np.ndarray, y: np.ndarray, level: float) -> float:
     return float(x[there[0]]) if len(there) else float("nan")
 
 
+def mean_until(x: np.ndarray, y: np.ndarray, end: float) -> float:
+    """Returns the mean height of a curve from 0 to `end`: its area there over `end`.
+
+    The curve is linear between its points, and from zero at x = 0 to the first one.
+
+    Args:
+      x: positive, strictly rising. Shape [X].
+      y: shape [X].
+      end: positive.
+
+    Returns:
+      NaN where the curve ends before.
+    """
+    if not len(x) or x[-1] < end:
+        return float("nan")
+    x, y = np.concatenate([[0.0], x]), np.concatenate([[0.0], y])
+    inside = x < end
+    x_inside, y_inside = x[inside], y[inside]
+    heights = np.append(y_inside, np.interp(end, x, y))
+    return float(np.trapezoid(heights, np.append(x_inside, end)) / end)
+
+
 def median_until(times: Sequence[float]) -> float:
     """Returns the median time, where NaN, for never, counts as later than all.
 

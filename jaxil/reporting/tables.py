@@ -9,7 +9,14 @@ import numpy as np
 
 from jaxil.reporting import statistics
 from jaxil.reporting.groups import Group, changes
-from jaxil.reporting.measures import LEVELS, Curve, Final, arrivals
+from jaxil.reporting.measures import (
+    EARLY_FRAMES,
+    LEVELS,
+    Curve,
+    Final,
+    arrivals,
+    early_share,
+)
 from jaxil.reporting.statistics import Estimate
 
 _NAN = float("nan")
@@ -20,7 +27,9 @@ _COUNTS += [f"frames_{percent}" for percent in _PERCENTS]
 _RETURNS = ["mean", "mean_low", "mean_high", "iqm", "iqm_low", "iqm_high", "median"]
 _RETURNS += ["expert", "expert_return", "last_return", "best_return"]
 _RETURNS += ["frames_per_second"]
+_EARLY = f"share_to_{EARLY_FRAMES // 1000}k"
 _SHARES = ["share_of_expert", *(f"reached_{percent}" for percent in _PERCENTS)]
+_SHARES += [_EARLY, f"{_EARLY}_low", f"{_EARLY}_high"]
 _HOURS = ["hours", *(f"hours_{percent}" for percent in _PERCENTS)]
 _FORMATS = {
     **dict.fromkeys(_COUNTS, ",.0f"),
@@ -36,6 +45,9 @@ _TITLES = {
     "mean_high": "to",
     "iqm_low": "90 % from",
     "iqm_high": "to",
+    _EARLY: f"IQM to {EARLY_FRAMES:,} frames",
+    f"{_EARLY}_low": "90 % from",
+    f"{_EARLY}_high": "to",
     **{f"reached_{percent}": f"reached {percent} %" for percent in _PERCENTS},
     **{f"frames_{percent}": f"{percent} % after frames" for percent in _PERCENTS},
     **{f"hours_{percent}": f"{percent} % after hours" for percent in _PERCENTS},
@@ -185,12 +197,20 @@ def efficiency_table(groups: Sequence[Group]) -> Table:
             for unit, times in (("frames", frames), ("hours", hours)):
                 median = statistics.median_until([each[k] for each in times])
                 row[f"{unit}_{percent}"] = median
+        early = np.array([early_share(run) for run in runs])
+        early = early[np.isfinite(early)]
+        estimate = Estimate(*[np.asarray(_NAN)] * 3)
+        if len(early):
+            estimate = statistics.interquartile_interval([early])
+        row |= _interval(_EARLY, estimate)
         speeds = [run.frames_per_second for run in runs]
         rows.append({**row, "frames_per_second": np.median(speeds)})
     about = (
         "When an evaluation first reached a share of the expert's return: the share of "
         "seeds that did, and the median over seeds, where those that never did count "
-        "as later than all others. Frames per second include evaluations."
+        "as later than all others. IQM: of the mean share of the expert's return up to "
+        f"{EARLY_FRAMES:,} frames, over the seeds that are as long. Frames per second "
+        "include evaluations."
     )
     return Table("sample_efficiency", "Sample efficiency", rows, about)
 

@@ -23,7 +23,7 @@ from jaxil.rewarders.discrimination import update_discriminator
 METHOD = methods.Method(
     name="pdac",
     label="P-DAC",
-    about="adversarial rewards on the critic's features",
+    about="adversarial rewards on single observations",
     colour="#0072B2",
     rank=1,
     sections={

@@ -277,3 +277,15 @@ def test_looks_are_one_colour_for_a_method_and_differ_within_it(found):
     assert looks["P-SIL"].colour == "#d55e00"
     pdac = [look for label, look in looks.items() if label.startswith("P-DAC")]
     assert len(set(pdac)) == len(pdac) == 3
+
+
+def test_sample_efficiency_up_to_100000_frames(tmp_path):
+    curves = [{50_000: 500, 150_000: 1000}, {50_000: 250, 150_000: 500}, {50_000: 900}]
+    read = [
+        runs.read(write_run(tmp_path / str(seed), "psil", "walker_walk", seed, returns))
+        for seed, returns in enumerate(curves)
+    ]
+    (row,) = tables.efficiency_table(groups.make_groups(read)).rows
+    # 0.4375 and half of it; the third run is too short to count.
+    assert row["share_to_100k"] == pytest.approx(0.328125)
+    assert row["share_to_100k_low"] < row["share_to_100k"] < row["share_to_100k_high"]

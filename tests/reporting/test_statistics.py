@@ -92,6 +92,16 @@ def test_first_reaching():
     assert np.isnan(statistics.first_reaching(frames[:0], returns[:0], 0.0))
 
 
+def test_mean_until_by_hand():
+    frames, shares = np.array([50.0, 150.0]), np.array([0.5, 1.0])
+    # 0 to 50: 0.25 in the mean; 50 to 100: from 0.5 to 0.75.
+    assert statistics.mean_until(frames, shares, 100.0) == pytest.approx(0.4375)
+    assert statistics.mean_until(frames, shares, 50.0) == pytest.approx(0.25)
+    assert statistics.mean_until(frames, shares, 150.0) == pytest.approx(87.5 / 150)
+    assert np.isnan(statistics.mean_until(frames, shares, 151.0))
+    assert np.isnan(statistics.mean_until(frames[:0], shares[:0], 1.0))
+
+
 @pytest.mark.parametrize(
     ("times", "expected"),
     [
