@@ -164,10 +164,10 @@ def _define(values: flags.FlagValues) -> None:
         kind(name, default, about, flag_values=values)
 
     text, number, yes = flags.DEFINE_string, flags.DEFINE_integer, flags.DEFINE_boolean
-    figure_names = ", ".join(f"figure{n}" for n in figures.FIGURES)
+    studies = ", ".join(figures.studies())
     methods = "methods, or package.module:METHOD; comma separated"
     define(flags.DEFINE_list, "methods", [], methods)
-    define(flags.DEFINE_list, "ablation", [], f"variants of {figure_names}")
+    define(flags.DEFINE_list, "ablation", [], f"variants of {studies}")
     define(flags.DEFINE_list, "tasks", list(figures.TASKS), "tasks, comma separated")
     define(number, "seeds", 10, "number of seeds")
     define(text, "preset", "paper", "paper, or tiny for CPU cores")

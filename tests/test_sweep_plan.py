@@ -42,6 +42,24 @@ def test_an_ablation_has_its_variants_and_its_shorter_budget(tmp_path):
     assert actions.total_frames == 3_000_000
 
 
+def test_video_alone_has_the_methods_without_actions_and_three_sets(tmp_path):
+    runs = make_runs(
+        tmp_path,
+        methods=[],
+        ablations=["video_alone"],
+        tasks=["finger_spin"],
+        num_seeds=1,
+        preset="tiny",
+    )
+    counts = {}
+    for run in runs:
+        config = config_of(run)
+        counts.setdefault(config.method, []).append(config.demonstrations.num_episodes)
+    assert {"pdac", "psil", "orca", "laifo", "patchail"} <= set(counts)
+    assert not {"bc", "dac", "drqv2", "zero"} & set(counts)
+    assert all(sorted(each) == [1, 10, 50] for each in counts.values())
+
+
 def test_methods_and_ablations_make_a_union_with_the_longer_budget(tmp_path):
     runs = make_runs(tmp_path, ablations=["figure8", "figure12"], num_seeds=1)
     budgets = {r.slug: r.total_frames for r in runs if r.task == "walker_run"}
@@ -60,7 +78,7 @@ def test_a_changed_field_names_the_variant_that_it_makes(tmp_path):
     (fault,) = faults_of(
         tmp_path, methods=[], ablations=["figure8"], overrides=overrides
     )
-    assert "is what a figure varies; leave it out" in fault
+    assert "is what an ablation varies; leave it out" in fault
 
 
 def test_a_field_changes_the_methods_that_have_it(tmp_path):

@@ -119,6 +119,25 @@ FIGURES = {
 }
 
 
+def studies() -> dict[str, Figure]:
+    """Returns what `jaxil sweep --ablation` offers, by name.
+
+    Those are the paper's figures, and `video_alone`: every method that plays and needs
+    no actions, from 1, 10 and 50 demonstrations.
+    """
+    alone = [
+        name
+        for name, method in methods.known().items()
+        if method.plays
+        and method.uses_demonstrations
+        and method.sees_actions is not True
+    ]
+    numbers = ({DEMONSTRATIONS: 1}, {}, {DEMONSTRATIONS: 50})
+    study = Figure(0, "video alone", "bars", _product(" ".join(alone), *numbers), True)
+    paper = {f"figure{number}": figure for number, figure in FIGURES.items()}
+    return {**paper, "video_alone": study}
+
+
 def declaration(name: str) -> Method:
     """Returns a method's declaration; of one that is not installed, its name only.
 

@@ -16,7 +16,6 @@ from jaxil.sweeps.state import Run
 from jaxil.training import workdir
 
 PRESETS = ("paper", "tiny")
-_FIGURES = {f"figure{number}": figure for number, figure in figures.FIGURES.items()}
 # What the sweep itself sets in each run.
 _OWN_FLAGS = {"seed": "--seeds", "task": "--tasks", "method": "--methods"}
 _SHOWN = 3  # runs that a fault lists
@@ -26,7 +25,7 @@ class Request(NamedTuple):
     """What the user asked for, unchecked."""
 
     methods: Sequence[str]
-    ablations: Sequence[str]  # such as "figure7"
+    ablations: Sequence[str]  # of `figures.studies`
     tasks: Sequence[str]
     num_seeds: int
     preset: str
@@ -87,8 +86,8 @@ def _request_problems(
         for fault in _method_problems(method):
             yield dataclasses.replace(fault, subject="--methods")
     for ablation in request.ablations:
-        if ablation not in _FIGURES:
-            yield unknown_name("--ablation", ablation, tuple(_FIGURES))
+        if ablation not in figures.studies():
+            yield unknown_name("--ablation", ablation, tuple(figures.studies()))
     if not request.tasks:
         yield Fault("--tasks", "is empty", "leave it out for the paper's eight")
     if request.num_seeds < 1:
@@ -109,7 +108,9 @@ def _request_problems(
     }
     for field, value in request.overrides.items():
         if any(field in choice.variant.overrides for choice in choices):
-            yield Fault(f"--config.{field}", "is what a figure varies", "leave it out")
+            yield Fault(
+                f"--config.{field}", "is what an ablation varies", "leave it out"
+            )
         elif field in _OWN_FLAGS:
             rule, way_out = "is what the sweep itself sets", f"use {_OWN_FLAGS[field]}"
             yield Fault(f"--config.{field}", rule, way_out, value)
@@ -129,7 +130,8 @@ def _choices(request: Request) -> list[_Choice]:
     """Returns the union of what methods and figures ask for, in their order."""
     known = [method for method in request.methods if not _method_problems(method)]
     named = [_Choice(figures.Variant(method), False) for method in known]
-    for figure in (_FIGURES[a] for a in request.ablations if a in _FIGURES):
+    studies = figures.studies()
+    for figure in (studies[a] for a in request.ablations if a in studies):
         named += [_Choice(variant, figure.is_ablation) for variant in figure.variants]
     union: dict[str, _Choice] = {}
     for choice in named:
