@@ -1,6 +1,7 @@
 """Principal components in parts: against a decomposition of all rows at once."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -49,8 +50,8 @@ def test_what_it_drops_is_lost_and_nothing_is_added():
 
 
 def test_coordinates_are_along_directions_of_length_one():
-    sketch = np.diag([3.0, 0.5, 0.0]).astype(np.float32)[:, [2, 0, 1]]
-    rows = np.asarray([[1.0, 2.0, 7.0]], np.float32)
+    sketch = jnp.diag(jnp.asarray([3.0, 0.5, 0.0]))[:, jnp.asarray([2, 0, 1])]
+    rows = jnp.asarray([[1.0, 2.0, 7.0]])
     # By hand: the directions are the columns 1, 2 and none.
     np.testing.assert_allclose(components.project(rows, sketch), [[2.0, 7.0, 0.0]])
 
@@ -58,4 +59,4 @@ def test_coordinates_are_along_directions_of_length_one():
 @pytest.mark.parametrize("rows", [(4,), (4, 5)])
 def test_rejects_rows_of_another_shape(rows):
     with pytest.raises(AssertionError):
-        components.merge(np.zeros((2, 6)), np.zeros(rows))
+        components.merge(jnp.zeros((2, 6)), jnp.zeros(rows))

@@ -1,6 +1,7 @@
 """The code of frames: what it is fitted to, for how long, and how it sees a stack."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -94,8 +95,8 @@ def test_nothing_changes_it_once_it_is_fixed():
 
 @pytest.mark.parametrize("stack", [1, 3])
 def test_an_episode_has_the_codes_of_its_observations(stack):
-    frames = random_frames(1, 20)
-    code = observe(empty(), make_episode(frames), experts())
+    episode = make_episode(random_frames(1, 20))
+    code, frames = observe(empty(), episode, experts()), jnp.asarray(episode.frames)
     stacked = stacking.stack_frames(frames, frame_stack=stack)
     np.testing.assert_allclose(
         codes.encode_episode(code, frames, frame_stack=stack),
