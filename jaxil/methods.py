@@ -116,13 +116,6 @@ DISCRIMINATOR_METRICS = (
     "discriminator/expert_logit",
     "discriminator/agent_logit",
 )
-NUM_COMPONENTS = Field(
-    0,
-    "principal components of each frame that are compared, fixed before the first "
-    "update; 0, the paper's: the agent's features",
-    0,
-    1024,
-)
 RELABELS = Field(
     True,
     "rewards are recomputed for every batch; False: stored, see reward_refresh_steps",

@@ -18,8 +18,8 @@ _SMALLEST_SCALE = 1e-3  # below it is rounding, which must not be magnified
 class FrameCode(struct.PyTreeNode):
     """Principal components of demonstrations and of play before the first update.
 
-    Fitted again by each episode until `is_fixed`. Both are needed: components of
-    demonstrations alone cannot tell where the agent is when it fails.
+    Fitted again by each episode until `is_fixed`, since a discriminator needs inputs
+    that keep their meaning. Play adds poses that no demonstration has.
 
     Attributes:
       mean: of demonstrations' frames, in [0, 1]. Shape [P], with P = H W 3.
