@@ -103,7 +103,9 @@ def make_expert(seed: int, size: int = 4) -> ExpertBatch:
 
 @functools.cache
 def jitted(learner: Learner):
-    return jax.jit(make_update_step(learner))
+    # Most of these run once or twice: fast code is not worth its compilation.
+    options = {"xla_backend_optimization_level": 0}
+    return jax.jit(make_update_step(learner), compiler_options=options)
 
 
 def numbers(leaf) -> np.ndarray:
