@@ -18,8 +18,13 @@ from tests.commands import ROOT, arguments, call, small_run
 from tests.demonstrations.videos import open_video
 
 _CLOCKS = ("seconds", "frames_per_second", "reward_seconds")
-# Three episodes; rewards are refreshed at frames 2000 and 3000.
-_REFRESHED = ("--config.reward_refresh_steps=100", "--config.total_frames=3000")
+# Three episodes; rewards are refreshed at frames 2000 and 3000. The components that the
+# discriminator judges are those of the first episode, also after a resumption.
+_REFRESHED = (
+    "--config.reward_refresh_steps=100",
+    "--config.total_frames=3000",
+    "--config.discriminator.num_components=4",
+)
 
 
 @pytest.fixture(scope="module", autouse=True)

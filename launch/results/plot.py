@@ -52,8 +52,8 @@ class Kind(NamedTuple):
 
 
 _KINDS = {
-    "components": Kind("P-DAC on components: the small preset", "#0072B2", width=2.2),
-    "features": Kind("P-DAC on the critic's features", "#56B4E9"),
+    "components": Kind("P-DAC, judging components", "#0072B2", width=2.2),
+    "features": Kind("P-DAC, judging features", "#56B4E9"),
     "psil": Kind("P-SIL", "#D55E00", width=1.6),
     "drqv2": Kind("true reward", "#009E73"),
     "state": Kind("imitation from state vectors", "#999999", "--"),
@@ -61,6 +61,7 @@ _KINDS = {
 }
 # Words in the names of runs that were made with changed code.
 _EXPERIMENTS = {"pca32", "pca64", "dynamics", "cloning1", "cloning3", "cloning10"}
+_EXPERIMENTS |= {"beside", "layernorm"}
 
 
 def kind_of(name: str, config: Mapping[str, Any]) -> str:
@@ -89,13 +90,15 @@ def plot_overview() -> None:
         for _, kind, table in sorted(runs[task], key=lambda run: -run[0]):
             label, colour, style, width = _KINDS[kind]
             x, y = table["frame"] / 1000, table["task_return_mean"]
-            axes.plot(x, y, style, color=colour, lw=width, label=label)
+            marker = "" if len(x) > 1 else "o"
+            look = {"color": colour, "lw": width, "marker": marker, "ms": 3}
+            axes.plot(x, y, style, label=label, **look)
         experts = [table["expert_task_return_mean"][-1] for *_, table in runs[task]]
         if experts:
             axes.axhline(max(experts), color="#222222", ls=":", lw=1.2, label="expert")
         else:
             words = {"ha": "center", "va": "center", "color": "#777777"}
-            axes.text(0.5, 0.5, "not tried yet", transform=axes.transAxes, **words)
+            axes.text(0.5, 0.5, "no evaluation yet", transform=axes.transAxes, **words)
         axes.set_title(task, fontsize=9)
         axes.set(xlim=(0, None), ylim=(0, 1050))
         axes.tick_params(labelsize=7)
