@@ -8,6 +8,7 @@ from jax import Array
 
 from jaxil.maths import components, stacking
 from jaxil.maths.types import Episode, ExpertEpisodes
+from jaxil.rewarders.discrimination import scaled
 
 # With the usual four episodes before the first update, both weigh alike.
 _DEMONSTRATION_ROWS, _EPISODE_ROWS = 1024, 256
@@ -89,15 +90,21 @@ def encode_episode(code: FrameCode, frames: Array, *, frame_stack: int) -> Array
 
 
 def _fit(code: FrameCode, episode: Episode, experts: ExpertEpisodes) -> FrameCode:
-    expert, play = _sample_demonstrations(experts), _sample_episode(episode.frames)
-    is_first = code.num_rows == 0.0
-    mean = jnp.where(is_first, jnp.mean(expert, axis=0), code.mean)
-    expert = jnp.where(is_first, expert - mean[None], 0.0)
-    rows = jnp.concatenate([expert, play - mean[None]])
+    code = jax.lax.cond(
+        code.num_rows == 0.0, lambda: _begin(code, experts), lambda: code
+    )
+    return _merge(code, _sample_episode(episode.frames))
+
+
+def _begin(code: FrameCode, experts: ExpertEpisodes) -> FrameCode:
+    rows = _sample_demonstrations(experts)
+    return _merge(code.replace(mean=jnp.mean(rows, axis=0)), rows)
+
+
+def _merge(code: FrameCode, rows: Array) -> FrameCode:
     return code.replace(
-        mean=mean,
-        sketch=components.merge(code.sketch, rows),
-        num_rows=code.num_rows + len(play) + jnp.where(is_first, len(expert), 0),
+        sketch=components.merge(code.sketch, rows - code.mean[None]),
+        num_rows=code.num_rows + len(rows),
     )
 
 
@@ -116,4 +123,4 @@ def _sample_episode(frames: Array) -> Array:
 
 
 def _rows(frames: Array) -> Array:
-    return frames.reshape(len(frames), -1).astype(jnp.float32) / 255.0
+    return scaled(frames).reshape(len(frames), -1)

@@ -116,7 +116,8 @@ def make_rewarder(
             width = num_components * agent.frame_stack
         width += spec.action_dim if sees_actions else 0
         params = discriminator.init(key, jnp.zeros((1, width)))
-        return JudgeState(**vars(init_module(params, optimiser)), code=code)
+        module = init_module(params, optimiser)
+        return JudgeState(module.params, module.opt_state, code)
 
     def observe(
         state: JudgeState,
