@@ -84,6 +84,18 @@ class Figure(NamedTuple):
     is_ablation: bool
 
 
+class Study(NamedTuple):
+    """What one name of `jaxil sweep --ablation` trains.
+
+    Attributes:
+      variants: what it compares.
+      has_short_budget: whether the paper's preset stops after ABLATION_FRAMES.
+    """
+
+    variants: tuple[Variant, ...]
+    has_short_budget: bool
+
+
 def _product(names: str, *changes: Mapping[str, Any]) -> tuple[Variant, ...]:
     return tuple(
         Variant(name, change) for name in names.split() for change in changes or [{}]
@@ -119,7 +131,7 @@ FIGURES = {
 }
 
 
-def studies() -> dict[str, Figure]:
+def studies() -> dict[str, Study]:
     """Returns what `jaxil sweep --ablation` offers, by name.
 
     Those are the paper's figures, and `video_alone`: every method that plays and needs
@@ -133,9 +145,11 @@ def studies() -> dict[str, Figure]:
         and method.sees_actions is not True
     ]
     numbers = ({DEMONSTRATIONS: 1}, {}, {DEMONSTRATIONS: 50})
-    study = Figure(0, "video alone", "bars", _product(" ".join(alone), *numbers), True)
-    paper = {f"figure{number}": figure for number, figure in FIGURES.items()}
-    return {**paper, "video_alone": study}
+    paper = {
+        f"figure{number}": Study(figure.variants, figure.is_ablation)
+        for number, figure in FIGURES.items()
+    }
+    return {**paper, "video_alone": Study(_product(" ".join(alone), *numbers), True)}
 
 
 def declaration(name: str) -> Method:

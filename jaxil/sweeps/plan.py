@@ -85,9 +85,10 @@ def _request_problems(
     for method in request.methods:
         for fault in _method_problems(method):
             yield dataclasses.replace(fault, subject="--methods")
+    studies = figures.studies()
     for ablation in request.ablations:
-        if ablation not in figures.studies():
-            yield unknown_name("--ablation", ablation, tuple(figures.studies()))
+        if ablation not in studies:
+            yield unknown_name("--ablation", ablation, tuple(studies))
     if not request.tasks:
         yield Fault("--tasks", "is empty", "leave it out for the paper's eight")
     if request.num_seeds < 1:
@@ -127,12 +128,14 @@ def _method_problems(method: str) -> tuple[Fault, ...]:
 
 
 def _choices(request: Request) -> list[_Choice]:
-    """Returns the union of what methods and figures ask for, in their order."""
+    """Returns the union of what methods and ablations ask for, in their order."""
     known = [method for method in request.methods if not _method_problems(method)]
     named = [_Choice(figures.Variant(method), False) for method in known]
     studies = figures.studies()
-    for figure in (studies[a] for a in request.ablations if a in studies):
-        named += [_Choice(variant, figure.is_ablation) for variant in figure.variants]
+    for study in (studies[a] for a in request.ablations if a in studies):
+        named += [
+            _Choice(variant, study.has_short_budget) for variant in study.variants
+        ]
     union: dict[str, _Choice] = {}
     for choice in named:
         before = union.setdefault(choice.variant.slug, choice)
