@@ -1,4 +1,4 @@
-r"""Plots overview.png and learning.png from RUN/eval.csv, cost.png from cost_*.json.
+r"""Plots overview.png from RUN/eval.csv, and cost.png from cost_*.json.
 
     python -m jaxil.benchmark --config=configs/psil.py:cartpole_swingup \
         --sweep=batch_size:32,64,128,256 --json=launch/results/cost_batch_size.json
@@ -17,20 +17,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from jaxil.files.tables import read_csv
+from jaxil.reporting.figures import TASKS
 
 _HERE = pathlib.Path(__file__).parent
-_TASKS = (
-    "ball_in_cup_catch",
-    "cartpole_swingup",
-    "finger_spin",
-    "walker_stand",
-    "walker_walk",
-    "cheetah_run",
-    "walker_run",
-    "acrobot_swingup",
-)
 _EPISODE_FRAMES = 1000
-_PRESET = "cartpole_swingup_pdac_repeat4_penalty1"
 # Field that was swept: x label, row of the benchmark, y label.
 _REWARD = ("reward_ms", "rewards of an episode, ms")
 _PANELS = {
@@ -86,7 +76,7 @@ def plot_overview() -> None:
         if len(table["frame"]):  # some ended before an evaluation
             runs[config["task"]].append((list(_KINDS).index(kind), kind, table))
     panels = _axes(2, 4, width=3.0, height=2.5)
-    for axes, task in zip(panels, _TASKS):
+    for axes, task in zip(panels, TASKS):
         for _, kind, table in sorted(runs[task], key=lambda run: -run[0]):
             label, colour, style, width = _KINDS[kind]
             x, y = table["frame"] / 1000, table["task_return_mean"]
@@ -116,33 +106,6 @@ def plot_overview() -> None:
     figure = panels[0].figure
     figure.legend([lines[label] for label in order], order, fontsize=8, **place)
     figure.savefig(_HERE / "overview.png")
-
-
-def plot_learning() -> None:
-    """Plots one line for each run: a panel for each task, one for the preset."""
-    panels = collections.defaultdict(list)
-    for path in sorted(_HERE.glob("*/eval.csv")):
-        name, config = path.parent.name, path.parent / "config.json"
-        task = json.loads(config.read_text())["config"]["task"]
-        title = f"{task}, P-DAC's preset" if _PRESET in name else task
-        if len((table := read_csv(path))["frame"]):
-            panels[title].append((name.removeprefix(f"{task}_"), table))
-    grid = _axes(-(-len(panels) // 2), 2, width=5.2, height=5.2)
-    for axes, (title, runs) in zip(grid, sorted(panels.items())):
-        expert = max(table["expert_task_return_mean"][-1] for _, table in runs)
-        axes.axhline(expert, color="#444444", ls="--", lw=1.2, label="expert")
-        axes.axhline(0.8 * expert, color="#444444", ls=":", label="80 % of it")
-        for name, table in runs:
-            axes.plot(
-                table["frame"] / 1000, table["task_return_mean"], "o-", ms=2, label=name
-            )
-        axes.set(title=title, xlim=(0, None), ylim=(0, 1050))
-        axes.set(xlabel="environment frames / 1000", ylabel="task return")
-        place = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16)}
-        axes.legend(**place, frameon=False, fontsize=7)
-    for axes in grid[len(panels) :]:
-        axes.set_axis_off()
-    grid[0].figure.savefig(_HERE / "learning.png")
 
 
 def plot_cost() -> None:
@@ -179,5 +142,4 @@ def _axes(rows: int, columns: int, *, width: float, height: float) -> list:
 
 if __name__ == "__main__":
     plot_overview()
-    plot_learning()
     plot_cost()
