@@ -91,6 +91,9 @@ FIELDS: dict[str, Field] = {
     "critic_target_tau": Field(
         0.01, "share of the new critic in its target; 0.01", 0, 1, positive=True
     ),
+    "policy_tau": Field(
+        1.0, "share of the newest policy in the one evaluated; 1", 0, 1, positive=True
+    ),
     "noise_clip": Field(0.3, "of exploration noise in updates; 0.3", 0.0, 2.0),
     "exploration_std_start": Field(1.0, "1 in the paper", 0.0, 10.0),
     "exploration_std_end": Field(0.1, "0.1 in the paper", 0.0, 10.0),
@@ -127,15 +130,10 @@ FIELDS: dict[str, Field] = {
         1, "updates sent to the device at once; the policy lags by one less", 1, 1_000
     ),
     "num_environments": Field(
-        1,
-        "environments side by side, each in a process; the policy lags by one less",
-        1,
-        64,
+        1, "side by side, each in a process; the policy lags by one less", 1, 64
     ),
     "compute_dtype": Field(
-        "float32",
-        "of convolutions and the product that follows them",
-        choices=("float32", "bfloat16"),
+        "float32", "of convolutions and trunks", choices=("float32", "bfloat16")
     ),
     # Looking at it.
     "eval_every_frames": Field(10_000, "10000 in DrQ-v2", 1, 10**10),

@@ -7,13 +7,15 @@ import sys
 import time
 import types
 
+import jax
 import numpy as np
 import pytest
+from flax.traverse_util import unflatten_dict
 
 import jaxil
 from jaxil import export
 from jaxil.files.tables import read_csv
-from jaxil.training import expert_distance, learning_curve, parts
+from jaxil.training import expert_distance, learner_files, learning_curve, parts
 from tests.commands import ROOT, arguments, call, small_run
 from tests.demonstrations.videos import open_video
 
@@ -24,6 +26,7 @@ _REFRESHED = (
     "--config.reward_refresh_steps=100",
     "--config.total_frames=3000",
     "--config.discriminator.num_components=4",
+    "--config.policy_tau=0.1",
 )
 
 
@@ -94,6 +97,17 @@ def test_pdac_trains_shows_itself_and_is_exported(unbroken):
     before = (unbroken / "train.csv").read_text()
     assert call("launch", *small_run("pdac", unbroken), *_REFRESHED).returncode == 0
     assert (unbroken / "train.csv").read_text() == before
+
+
+def test_the_average_policy_is_kept(unbroken):
+    policy = jaxil.load_policy(unbroken)
+    _, arrays = learner_files.read(unbroken / "checkpoints" / "frame_000000003000")
+    tree = unflatten_dict(arrays, sep=".")
+    for name in ("encoder", "actor"):
+        kept = getattr(policy.params, name)
+        jax.tree.map(np.testing.assert_array_equal, kept, tree["average"][name])
+        newest = jax.tree.leaves(tree[name]["params"])
+        assert not all(map(np.array_equal, jax.tree.leaves(kept), newest))
 
 
 @pytest.mark.usefixtures("plain")

@@ -25,6 +25,13 @@ class LearnerParams(NamedTuple):
     critic: Params
 
 
+class PolicyParams(NamedTuple):
+    """The parameters that a policy acts with."""
+
+    encoder: Params
+    actor: Params
+
+
 class ModuleState(struct.PyTreeNode):
     """Parameters of one network with the state of its optimiser."""
 
@@ -47,6 +54,8 @@ class TrainState(struct.PyTreeNode):
       key: base random key. Never consumed: update number n uses
         `fold_in(key, n)`, so a resumed run has the random numbers of an unbroken one.
       num_updates: gradient steps so far. Shape [], int32.
+      average: of the policies so far, see `averaging.average_policy`; None where the
+        newest is evaluated.
     """
 
     encoder: ModuleState
@@ -56,11 +65,22 @@ class TrainState(struct.PyTreeNode):
     rewarder: Any
     key: Array
     num_updates: Array
+    average: PolicyParams | None = None
 
     @property
     def params(self) -> LearnerParams:
         """The live parameters, for policies and rewarders."""
         return LearnerParams(self.encoder.params, self.actor.params, self.critic.params)
+
+    @property
+    def newest_policy(self) -> PolicyParams:
+        """The policy that collects experience."""
+        return PolicyParams(self.encoder.params, self.actor.params)
+
+    @property
+    def policy(self) -> PolicyParams:
+        """The policy that is evaluated."""
+        return self.newest_policy if self.average is None else self.average
 
 
 def init_module(params: Params, optimiser: optax.GradientTransformation) -> ModuleState:

@@ -8,6 +8,9 @@ shadows. Other deviations from the paper:
 - The mean image of the demonstrations is subtracted and the contrast raised, since a
   small moving body is only a few pixels at 48x48.
 - The squared pre-tanh mean is penalised, since small actors saturate permanently.
+- The average of the policies of about the last 1000 updates is evaluated and kept
+  (`policy_tau`), since the newest is worse from one evaluation to the next as often as
+  it is better. Training never uses it.
 - Exploration ends sooner, the agent updates every step and learning rates are higher,
   since runs have to be short.
 - The replay is smaller, so that its rewards are newer, and they are recomputed
@@ -61,6 +64,7 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     config.update_every_steps = 1
     config.learning_rate = 3e-4
     config.pre_tanh_penalty = 2e-3
+    config.policy_tau = 1e-3
     config.replay_size_steps = 50_000
     config.replay_on_device = True  # also on CPUs, where XLA stacks faster than NumPy
     config.exploration_std_steps = 50_000

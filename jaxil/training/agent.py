@@ -10,6 +10,7 @@ from jaxil import methods
 from jaxil.config import Config
 from jaxil.demonstrations import loading
 from jaxil.environments.pixel_environment import PixelEnvironment
+from jaxil.learner.averaging import make_averaging_step
 from jaxil.learner.gathering import Step, make_gathering_step, make_repeated_step
 from jaxil.learner.policy import (
     MeanAction,
@@ -207,6 +208,9 @@ def make_agent(
     if method.make_update_step is not None:
         make_step = methods.load(config.method, method.make_update_step)
         step = make_step(learner, **_own_fields(config))
+    averages = config.policy_tau < 1.0
+    if averages:
+        step = make_averaging_step(step, tau=config.policy_tau)
     step = make_gathering_step(step)
     return Agent(
         # The old state is dead after the call, so XLA may reuse its memory.
@@ -223,7 +227,11 @@ def make_agent(
         # Compiled, and kept in the cache: one by one, its 450 operations take longer.
         init_state=jax.jit(
             lambda: init_train_state(
-                learner, jax.random.key(config.seed), observation, spec
+                learner,
+                jax.random.key(config.seed),
+                observation,
+                spec,
+                averages=averages,
             )
         ),
     )

@@ -189,6 +189,7 @@ class Checkpoints:
             lambda _, arrays: unflatten_dict(arrays, sep=".")
         )
         networks = {name: tree[name]["params"] for name in LearnerParams._fields}
+        networks |= tree.get("average", {})  # of encoder and actor, if the run has it
         image = path / f"{_MEAN_IMAGE}.npy"
         return networks, np.load(image) if image.exists() else None, record["counters"]
 

@@ -71,7 +71,7 @@ class Evaluator:
           None if it was stopped.
         """
         config = self._config
-        encoder, actor, _ = state.params
+        encoder, actor = state.policy
 
         def act(observation: np.ndarray) -> np.ndarray:
             return np.asarray(

@@ -1,0 +1,53 @@
+"""The average of a run's policies, which is evaluated in place of the newest."""
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxil.learner.state import PolicyParams, TrainState
+from jaxil.learner.update import UpdateStep
+from jaxil.maths.types import Batch, ExpertBatch, Metrics
+
+
+def average_policy(
+    average: PolicyParams, newest: PolicyParams, num_updates: Array, *, tau: float
+) -> PolicyParams:
+    """Returns the average after one more update.
+
+        a_n = a_{n-1} + max(tau, 1 / n) (p_n - a_{n-1})
+
+    so the mean of all policies for 1 / tau updates, then an exponential average that
+    has forgotten the first ones.
+
+    Args:
+      average: a_{n-1}; any where n is 1.
+      newest: p_n.
+      num_updates: n, at least 1. Shape [].
+      tau: share of the newest.
+
+    Source: Polyak and Juditsky 1992 average iterates; of policies, e.g. Lillicrap et
+    al. 2016 (DDPG's target actor), here for evaluation alone.
+    """
+    share = jnp.maximum(tau, 1.0 / num_updates)
+    return jax.tree.map(lambda old, new: old + share * (new - old), average, newest)
+
+
+def make_averaging_step(step: UpdateStep, *, tau: float) -> UpdateStep:
+    """Returns a learning step that also averages its policies.
+
+    Args:
+      step: any method's.
+      tau: see `average_policy`.
+    """
+
+    def averaging_step(
+        state: TrainState, batch: Batch, expert: ExpertBatch | None
+    ) -> tuple[TrainState, Metrics]:
+        state, metrics = step(state, batch, expert)
+        assert state.average is not None
+        average = average_policy(
+            state.average, state.newest_policy, state.num_updates, tau=tau
+        )
+        return state.replace(average=average), metrics
+
+    return averaging_step
