@@ -4,6 +4,8 @@
 #   bash launch/quickstart.sh
 #       imitates ten episodes of cartpole_swingup from pixels, with small networks that
 #       learn on two CPU cores, into runs/quickstart
+#   bash launch/quickstart.sh --config.seed=1 --workdir=runs/seed1
+#       the same with other settings
 #   bash launch/quickstart.sh --config=configs/psil.py:walker_walk --workdir=runs/x
 #       runs `python -m jaxil.launch` with these flags
 #
@@ -32,9 +34,22 @@ case " $* " in
     ;;
 esac
 set_up "$extras"
-if (($# == 0)); then
-  set -- --config=configs/tiny.py:pdac,cartpole_swingup --workdir=runs/quickstart
-  say "Training into $root/runs/quickstart: watch learning_curve.png, videos/ and" \
-    "eval.csv there. Ctrl-C saves and stops; rerun the same command to resume."
+
+has_flag() { # name, words
+  local name=$1 word
+  shift
+  for word; do
+    case $word in "$name" | "$name="*) return 0 ;; esac
+  done
+  return 1
+}
+
+if ! has_flag --config "$@" && ! has_flag --help "$@" && ! has_flag -h "$@"; then
+  if ! has_flag --workdir "$@"; then
+    set -- --workdir=runs/quickstart "$@"
+    say "Training into $root/runs/quickstart: watch learning_curve.png, videos/ and" \
+      "eval.csv there. Ctrl-C saves and stops; rerun the same command to resume."
+  fi
+  set -- --config=configs/tiny.py:pdac,cartpole_swingup "$@"
 fi
 exec "$venv/bin/python" -m jaxil.launch "$@"

@@ -20,6 +20,7 @@ case "$*" in
   "-m pip "*) echo "pip begins: $*" >>"$NOTES"; sleep "${PIP_SECONDS:-0}"
     [ -z "$PIP_FAILS" ] || { echo "no such package"; exit 1; }
     echo "pip ends" >>"$NOTES" ;;
+  "-m jaxil.launch "*) echo "${*#-m jaxil.}" >>"$NOTES" ;;
 esac
 """
 
@@ -27,7 +28,8 @@ esac
 @pytest.fixture(name="project")
 def _project(tmp_path):
     (tmp_path / "launch").mkdir()
-    for name in ("setup.cfg", "launch/setup.sh", "launch/constraints.txt"):
+    launch = ("launch/setup.sh", "launch/quickstart.sh", "launch/constraints.txt")
+    for name in ("setup.cfg", *launch):
         shutil.copy(ROOT / name, tmp_path / name)
     python = tmp_path / "other-python"
     python.write_text(_PYTHON)
@@ -113,3 +115,30 @@ def test_other_pythons_are_refused(project):
     status, printed, found = run(project, VERSION="3.13")
     assert (status, found) == (2, [])
     assert "PYTHON=PATH" in printed
+
+
+_CONFIG = "--config=configs/tiny.py:pdac,cartpole_swingup"
+_DEFAULTS = _CONFIG, "--workdir=runs/quickstart"
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ((), _DEFAULTS),
+        (("--config.seed=1",), (*_DEFAULTS, "--config.seed=1")),
+        (("--workdir", "runs/x"), (_CONFIG, "--workdir", "runs/x")),
+        (("--config=a.py", "--workdir=b"), ("--config=a.py", "--workdir=b")),
+        (("--config", "a.py"), ("--config", "a.py")),
+    ],
+)
+def test_the_quickstart_fills_in_what_is_not_said(project, flags, expected):
+    variables = {"PYTHON": str(project / "other-python"), "CC": "true"}
+    variables |= {"NOTES": str(project / "notes"), "JAX_PLATFORMS": "cpu"}
+    subprocess.run(
+        ["bash", "launch/quickstart.sh", *flags],
+        cwd=project,
+        env={**os.environ, **variables},
+        check=True,
+        timeout=60,
+    )
+    assert notes(project)[-1] == " ".join(("launch", *expected))

@@ -57,8 +57,11 @@ def observe(code: FrameCode, episode: Episode, experts: ExpertEpisodes) -> Frame
 
 
 def encode_frames(code: FrameCode, frames: Array) -> Array:
-    """Returns the codes of frames: [M, H, W, 3] to [M, K]."""
-    scale = jnp.sqrt(jnp.sum(code.sketch**2) / jnp.maximum(code.num_rows, 1.0))
+    """Returns the codes of frames: [M, H, W, 3] to [M, K].
+
+    NaN before the first episode, so that a loop without `observe` ends at once.
+    """
+    scale = jnp.sqrt(jnp.sum(code.sketch**2) / code.num_rows)
     codes = components.project(_rows(frames) - code.mean[None], code.sketch)
     return codes * (_NORM / jnp.maximum(scale, _SMALLEST_SCALE))
 

@@ -93,6 +93,10 @@ def test_nothing_changes_it_once_it_is_fixed():
     jax.tree.map(np.testing.assert_array_equal, after, fixed)
 
 
+def test_a_code_that_has_seen_nothing_gives_no_numbers():
+    assert np.isnan(encode_frames(empty(), random_frames(1, 2))).all()
+
+
 @pytest.mark.parametrize("stack", [1, 3])
 def test_an_episode_has_the_codes_of_its_observations(stack):
     episode = make_episode(random_frames(1, 20))
