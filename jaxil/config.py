@@ -92,7 +92,11 @@ FIELDS: dict[str, Field] = {
         0.01, "share of the new critic in its target; 0.01", 0, 1, positive=True
     ),
     "policy_tau": Field(
-        1.0, "share of the newest policy in the one evaluated; 1", 0, 1, positive=True
+        1.0,
+        "share of the newest policy in the average that is evaluated; 1: no average",
+        0,
+        1,
+        positive=True,
     ),
     "noise_clip": Field(0.3, "of exploration noise in updates; 0.3", 0.0, 2.0),
     "exploration_std_start": Field(1.0, "1 in the paper", 0.0, 10.0),

@@ -1,5 +1,6 @@
 """The average of a run's policies, which is evaluated in place of the newest."""
 
+import chex
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -16,8 +17,7 @@ def average_policy(
 
         a_n = a_{n-1} + max(tau, 1 / n) (p_n - a_{n-1})
 
-    so the mean of all policies for 1 / tau updates, then an exponential average that
-    has forgotten the first ones.
+    the mean of all policies for 1 / tau updates, then an exponential average.
 
     Args:
       average: a_{n-1}; any where n is 1.
@@ -28,6 +28,8 @@ def average_policy(
     Source: Polyak and Juditsky 1992 average iterates; of policies, e.g. Lillicrap et
     al. 2016 (DDPG's target actor), here for evaluation alone.
     """
+    chex.assert_rank(num_updates, 0)
+    chex.assert_trees_all_equal_shapes(average, newest)
     share = jnp.maximum(tau, 1.0 / num_updates)
     return jax.tree.map(lambda old, new: old + share * (new - old), average, newest)
 
