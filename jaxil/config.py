@@ -51,8 +51,7 @@ FIELDS: dict[str, Field] = {
     ),
     "max_episode_frames": Field(
         0,
-        "longest episode, cut off as by a time limit; 0: the task's own limit, or 1000 "
-        "if it has none",
+        "longest episode, as by a time limit; 0: the task's own, or 1000 without one",
         0,
         10**8,
     ),
@@ -126,9 +125,7 @@ FIELDS: dict[str, Field] = {
     **{f"demonstrations.{name}": field for name, field in DEMONSTRATIONS.items()},
     # Speed.
     "replay_on_device": Field(
-        False,
-        "keeps a copy of the replay's frames on the device; batches then hold indices. "
-        "Samples, and what checkpoints save, are the same",
+        False, "keeps a copy of the replay's frames on the device; only speed changes"
     ),
     "updates_per_dispatch": Field(
         1, "updates sent to the device at once; the policy lags by one less", 1, 1_000
