@@ -23,14 +23,12 @@ shadows. Other deviations from the paper:
 - cartpole_swingup repeats actions 4 times: with 2, a pole at 1 rad/s moves a quarter of
   a pixel between frames, which hides its speed, and agents only learned to spin it;
   with 8, none learned to balance it. P-DAC's gradient penalty has weight 1 there.
-- ball_in_cup_catch repeats actions 4 times too: a run of as many frames takes half as
-  long and learns as much.
 """
 
 from jaxil import config as jaxil_config
 from jaxil.errors import Fault, UsageError
 
-_ACTION_REPEATS = {"ball_in_cup_catch": 4, "cartpole_swingup": 4}
+_ACTION_REPEATS = {"cartpole_swingup": 4}
 _GRADIENT_PENALTIES = {("pdac", "cartpole_swingup"): 1.0}
 _NUM_COMPONENTS = {"walker_stand": 32, "walker_walk": 32, "walker_run": 32}
 # These have a separate encoder, and penalties need its second derivatives: with 64, an
