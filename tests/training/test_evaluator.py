@@ -31,7 +31,8 @@ def test_the_average_is_played_where_there_is_one(averages):
     config = default_config()
     config.update(num_eval_episodes=2, video_every_evals=0)
     agent: Any = types.SimpleNamespace(mean_action=mean_action)
-    evaluator = Evaluator(config, agent, Counting(EPISODE_STEPS), None, None)
+    environment: Any = Counting(EPISODE_STEPS)
+    evaluator = Evaluator(config, agent, environment, None, None)
     result = evaluator.evaluate(
         state, number=0, is_last=False, stop_asked=lambda: False
     )
