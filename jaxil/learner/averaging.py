@@ -1,11 +1,11 @@
 """The average of a run's policies, which is evaluated in place of the newest."""
 
 import chex
-import jax
 import jax.numpy as jnp
+import optax
 from jax import Array
 
-from jaxil.learner.state import PolicyParams, TrainState
+from jaxil.learner.state import PolicyParams, TrainState, copy_params
 from jaxil.learner.update import UpdateStep
 from jaxil.maths.types import Batch, ExpertBatch, Metrics
 
@@ -20,7 +20,7 @@ def average_policy(
     the mean of all policies for 1 / tau updates, then an exponential average.
 
     Args:
-      average: a_{n-1}; any where n is 1.
+      average: a_{n-1}; any finite where n is 1.
       newest: p_n.
       num_updates: n, at least 1. Shape [].
       tau: share of the newest.
@@ -31,7 +31,13 @@ def average_policy(
     chex.assert_rank(num_updates, 0)
     chex.assert_trees_all_equal_shapes(average, newest)
     share = jnp.maximum(tau, 1.0 / num_updates)
-    return jax.tree.map(lambda old, new: old + share * (new - old), average, newest)
+    pairs = zip(newest, average, strict=True)
+    return PolicyParams(*(optax.incremental_update(*pair, share) for pair in pairs))
+
+
+def begin_average(state: TrainState) -> TrainState:
+    """Returns a state whose updates `make_averaging_step` may average."""
+    return state.replace(average=PolicyParams(*map(copy_params, state.newest_policy)))
 
 
 def make_averaging_step(step: UpdateStep, *, tau: float) -> UpdateStep:

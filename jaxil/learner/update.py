@@ -12,7 +12,6 @@ from jax import Array
 from jaxil.learner.rewarder import AgentView, Rewarder, Spec
 from jaxil.learner.state import (
     LearnerParams,
-    PolicyParams,
     TrainState,
     apply_gradients,
     copy_params,
@@ -58,12 +57,7 @@ class Learner:
 
 
 def init_train_state(
-    learner: Learner,
-    key: Array,
-    observation: Data,
-    spec: Spec,
-    *,
-    averages: bool = False,
+    learner: Learner, key: Array, observation: Data, spec: Spec
 ) -> TrainState:
     """Returns the state before the first update.
 
@@ -72,7 +66,6 @@ def init_train_state(
       key: becomes the state's base key.
       observation: an example of one observation, without batch axis.
       spec: sizes.
-      averages: whether policies are averaged.
     """
     networks = learner.networks
     # Larger than all update numbers, so no random number is used twice.
@@ -95,7 +88,6 @@ def init_train_state(
         rewarder=learner.rewarder.init(rewarder_key, spec, params),
         key=jax.random.clone(key),  # the caller may still use its own
         num_updates=jnp.zeros((), jnp.int32),
-        average=PolicyParams(*copy_params((encoder, actor))) if averages else None,
     )
 
 

@@ -10,7 +10,7 @@ from jaxil import methods
 from jaxil.config import Config
 from jaxil.demonstrations import loading
 from jaxil.environments.pixel_environment import PixelEnvironment
-from jaxil.learner.averaging import make_averaging_step
+from jaxil.learner.averaging import begin_average, make_averaging_step
 from jaxil.learner.gathering import Step, make_gathering_step, make_repeated_step
 from jaxil.learner.policy import (
     MeanAction,
@@ -212,6 +212,12 @@ def make_agent(
     if averages:
         step = make_averaging_step(step, tau=config.policy_tau)
     step = make_gathering_step(step)
+
+    def init_state() -> TrainState:
+        key = jax.random.key(config.seed)
+        state = init_train_state(learner, key, observation, spec)
+        return begin_average(state) if averages else state
+
     return Agent(
         # The old state is dead after the call, so XLA may reuse its memory.
         update_step=jax.jit(step, donate_argnums=0),
@@ -225,15 +231,7 @@ def make_agent(
         rewarder=rewarder,
         mean_image=mean if isinstance(mean, np.ndarray) else None,
         # Compiled, and kept in the cache: one by one, its 450 operations take longer.
-        init_state=jax.jit(
-            lambda: init_train_state(
-                learner,
-                jax.random.key(config.seed),
-                observation,
-                spec,
-                averages=averages,
-            )
-        ),
+        init_state=jax.jit(init_state),
     )
 
 

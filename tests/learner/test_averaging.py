@@ -7,7 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxil.learner.averaging import average_policy, make_averaging_step
+from jaxil.learner.averaging import (
+    average_policy,
+    begin_average,
+    make_averaging_step,
+)
 from jaxil.learner.state import PolicyParams
 from jaxil.learner.update import make_update_step
 from tests.learner.small_learner import make_batch, make_learner, make_state
@@ -29,7 +33,7 @@ def averages(values, tau, first=1e3):
     return found
 
 
-def same(one, other) -> None:
+def assert_same(one, other) -> None:
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), one, other
     )
@@ -61,11 +65,12 @@ def test_training_is_the_same_with_it(tau):
     plain = jax.jit(plain)
     alone = make_state(learner)
     expected = alone.newest_policy
-    state = alone.replace(average=expected)
+    state = begin_average(alone)
+    assert_same(state.policy, expected)
     for number in range(1, 7):
         state, metrics = averaging(state, make_batch(number), None)
         alone, plain_metrics = plain(alone, make_batch(number), None)
         expected = AVERAGE(expected, alone.newest_policy, jnp.int32(number), tau=tau)
-    same((state.params, metrics), (alone.params, plain_metrics))
-    same(state.policy, expected)
-    same(alone.policy, alone.newest_policy)
+    assert_same((state.params, metrics), (alone.params, plain_metrics))
+    assert_same(state.policy, expected)
+    assert_same(alone.policy, alone.newest_policy)
