@@ -34,6 +34,7 @@ SETTINGS = {
         "batch_size": 8,
         "sees_actions": True,
         "num_components": 0,
+        "input_scale": 0.5,
     },
     "psil": {
         "cost": "cosine",
