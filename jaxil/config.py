@@ -50,10 +50,7 @@ FIELDS: dict[str, Field] = {
         choices=("none", "easy", "medium", "hard"),
     ),
     "max_episode_frames": Field(
-        0,
-        "longest episode, as by a time limit; 0: the task's own, or 1000 without one",
-        0,
-        10**8,
+        0, "longest episode; 0: the task's own, or 1000 without one", 0, 10**8
     ),
     "total_frames": Field(_EASY_FRAMES, "length of the run", 1, 10**10),
     # Replay and schedule.
@@ -84,6 +81,10 @@ FIELDS: dict[str, Field] = {
     # DrQ-v2.
     "learning_rate": Field(
         1e-4, "of each network's Adam; 1e-4 in the paper", 0, 1, positive=True
+    ),
+    "learning_rate_end": Field(1e-4, "after learning_rate_steps", 0, 1, positive=True),
+    "learning_rate_steps": Field(
+        0, "agent steps from learning_rate to learning_rate_end; 0: constant", 0, 10**9
     ),
     "feature_dim": Field(50, "width of the trunks; 50 in the paper", 1, 10**5),
     "hidden_dim": Field(1024, "of actor and critic; 1024 in the paper", 1, 10**5),
@@ -147,8 +148,8 @@ FIELDS: dict[str, Field] = {
         "", "beside the tables and TensorBoard: wandb, or package.module:function"
     ),
 }
-# Fields that change what is kept or shown, or how fast it comes, and nothing that is
-# learned: runs that differ in no other are seeds of one thing, and may be resumed.
+# Fields that change nothing that is learned: runs that differ in no other are seeds of
+# one thing, and may be resumed.
 FREE_FIELDS = (
     "total_frames",
     "encoder.convolutions",

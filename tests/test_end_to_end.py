@@ -27,6 +27,7 @@ _REFRESHED = (
     "--config.total_frames=3000",
     "--config.discriminator.num_components=4",
     "--config.policy_tau=0.1",
+    "--config.learning_rate_steps=100",
 )
 
 

@@ -33,7 +33,7 @@ class Learner:
     Attributes:
       networks: encoder, actor and critic.
       rewarder: the imitation method.
-      learning_rate: of each network's own Adam.
+      learning_rate: of each network's own Adam, or its schedule by update number.
       critic_target_tau: share of the new critic in the target, each update.
       noise_clip: bound of the exploration noise in updates.
       shift_padding: largest random shift, in pixels.
@@ -43,7 +43,7 @@ class Learner:
 
     networks: AgentNetworks
     rewarder: Rewarder
-    learning_rate: float
+    learning_rate: optax.ScalarOrSchedule
     critic_target_tau: float
     noise_clip: float
     shift_padding: int

@@ -1,5 +1,6 @@
 """From a checked config to the compiled functions of an agent."""
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -73,6 +74,16 @@ def exploration_schedule(config: Config) -> optax.Schedule:
         config.exploration_std_start,
         config.exploration_std_end,
         config.exploration_std_steps,
+    )
+
+
+def learning_rate(config: Config) -> optax.ScalarOrSchedule:
+    """Returns the learner's rate, by update number where it changes."""
+    if not config.learning_rate_steps:
+        return config.learning_rate
+    num_updates = config.learning_rate_steps / config.update_every_steps
+    return optax.linear_schedule(
+        config.learning_rate, config.learning_rate_end, math.ceil(num_updates)
     )
 
 
@@ -183,7 +194,7 @@ def make_agent(
     learner = Learner(
         networks=networks,
         rewarder=rewarder,
-        learning_rate=config.learning_rate,
+        learning_rate=learning_rate(config),
         critic_target_tau=config.critic_target_tau,
         noise_clip=config.noise_clip,
         shift_padding=config.shift_padding,

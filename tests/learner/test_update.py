@@ -4,8 +4,10 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
+from jaxil.learner.state import init_module
 from jaxil.learner.update import make_update_step
 from jaxil.native import build
 from jaxil.networks.agent import apply
@@ -109,6 +111,26 @@ def test_noise_follows_the_number_of_the_update(num_updates, std):
     state = make_state(learner).replace(num_updates=jnp.asarray(num_updates, jnp.int32))
     _, metrics = jitted(learner)(state, make_batch(0), None)
     np.testing.assert_allclose(metrics["exploration_std"], std, atol=1e-6)
+
+
+def test_nothing_moves_once_the_learning_rate_has_fallen_to_zero():
+    learner = make_learner(learning_rate=optax.linear_schedule(1e-3, 0.0, 2))
+    optimiser, start = learner.optimiser, make_state(learner)
+    step = jitted(learner)
+    states = [
+        start.replace(  # `make_state` knows constant rates alone
+            encoder=init_module(start.encoder.params, optimiser),
+            critic=init_module(start.critic.params, optimiser),
+            actor=init_module(start.actor.params, optimiser),
+        )
+    ]
+    for seed in range(3):
+        states.append(step(states[-1], make_batch(seed), None)[0])
+    for one, other, moves in ((0, 1, True), (1, 2, True), (2, 3, False)):
+        before, after = states[one], states[other]
+        assert any_difference(before.encoder.params, after.encoder.params) == moves
+        assert any_difference(before.critic.params, after.critic.params) == moves
+        assert any_difference(before.actor.params, after.actor.params) == moves
 
 
 @pytest.mark.parametrize(
