@@ -1,5 +1,6 @@
 """From a config to the functions of an agent."""
 
+import numpy as np
 import pytest
 
 from jaxil import config as jaxil_config
@@ -19,4 +20,4 @@ def test_its_steps_are_the_agents_and_not_updates(num_updates, expected):
     config.learning_rate_steps, config.update_every_steps = 200, 2
     schedule = agent.learning_rate(config)
     assert callable(schedule)
-    assert float(schedule(num_updates)) == pytest.approx(expected)
+    np.testing.assert_allclose(schedule(num_updates), expected, rtol=1e-6, atol=1e-9)
