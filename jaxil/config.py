@@ -82,7 +82,7 @@ FIELDS: dict[str, Field] = {
     "learning_rate": Field(
         1e-4, "of each network's Adam; 1e-4 in the paper", 0, 1, positive=True
     ),
-    "learning_rate_end": Field(1e-4, "after learning_rate_steps", 0, 1, positive=True),
+    "learning_rate_end": Field(0.0, "after learning_rate_steps", 0, 1),
     "learning_rate_steps": Field(
         0, "agent steps from learning_rate to learning_rate_end; 0: constant", 0, 10**9
     ),
@@ -140,9 +140,7 @@ FIELDS: dict[str, Field] = {
     # Looking at it.
     "eval_every_frames": Field(10_000, "10000 in DrQ-v2", 1, 10**10),
     "num_eval_episodes": Field(10, "10 in DrQ-v2", 1, 10**4),
-    "checkpoint_every_frames": Field(
-        10_000, "what a killed run loses at most", 1, 10**10
-    ),
+    "checkpoint_every_frames": Field(10_000, "most that a kill loses", 1, 10**10),
     "video_every_evals": Field(5, "0 turns videos off", 0, 10**6),
     "logger": Field(
         "", "beside the tables and TensorBoard: wandb, or package.module:function"
@@ -166,6 +164,11 @@ _WHOLE_DECISIONS = (
     "seed_frames",
     "eval_every_frames",
     "checkpoint_every_frames",
+)
+# Schedules, by the fields of their first and last value.
+_FALLING = (
+    ("exploration_std_start", "exploration_std_end"),
+    ("learning_rate", "learning_rate_end"),
 )
 
 
@@ -278,13 +281,10 @@ def _problems(
             f"use replay_size_steps={math.ceil(longest)} or more",
             config.max_episode_frames,
         )
-    if config.exploration_std_end > config.exploration_std_start:
-        yield Fault(
-            "exploration_std_end",
-            f"is above exploration_std_start={config.exploration_std_start}",
-            "noise must not grow",
-            config.exploration_std_end,
-        )
+    for start, end in _FALLING:
+        first, last = read(config, start), read(config, end)
+        if not {start, end} & bad and last > first:
+            yield Fault(end, f"is above {start}={first}", "it must not grow", last)
     adversary = config.get("discriminator", {}).get("batch_size", 0)
     if not {"batch_size", "discriminator.batch_size"} & bad and (
         adversary > config.batch_size
