@@ -40,7 +40,7 @@ def warn_of_pixels(
     if metadata["task"] != task or tasks.is_of_suite(task):
         messages.append(
             f"{path} ({metadata['kind']}) holds pixels of another renderer: light, "
-            "colours and camera may differ from the agent's."
+            "colours and camera may differ from the agent's. See --config.camera."
         )
     if (height, width) != (size, size):
         how = "" if height == width else f", {_FITS[fit]} (demonstrations.fit={fit})"

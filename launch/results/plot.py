@@ -16,7 +16,10 @@ from typing import Any, NamedTuple
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from jaxil import methods
+from jaxil.config import default_config
 from jaxil.files.tables import read_csv
+from jaxil.presets import tiny
 from jaxil.reporting.figures import TASKS
 
 _HERE = pathlib.Path(__file__).parent
@@ -42,18 +45,22 @@ class Kind(NamedTuple):
 
 
 _KINDS = {
-    "components": Kind("P-DAC, judging components", "#0072B2", width=2.2),
-    "features": Kind("P-DAC, judging features", "#56B4E9"),
-    "psil": Kind("P-SIL", "#D55E00", width=1.6),
+    "pdac": Kind("P-DAC, today's small preset", "#0072B2", width=2.2),
+    "psil": Kind("P-SIL, today's small preset", "#D55E00", width=2.2),
+    "earlier pdac": Kind("P-DAC, other settings", "#56B4E9"),
+    "earlier psil": Kind("P-SIL, other settings", "#E69F00"),
     "drqv2": Kind("true reward", "#009E73"),
     "state": Kind("imitation from state vectors", "#999999", "--"),
     "other": Kind("experiments and controls", "#cccccc"),
 }
 # Words in the names of runs that were made with changed code.
 _EXPERIMENTS = {"pca32", "pca64", "dynamics", "cloning1", "cloning3", "cloning10"}
-_EXPERIMENTS |= {"beside", "layernorm", "centred", "std10k"}
+_EXPERIMENTS |= {"beside", "layernorm", "centred", "std10k", "greedy", "reconstruction"}
 _EXPERIMENTS |= {"lowrate", "scaled", "gradients", "nstep3", "decay"}
 _EXPERIMENTS |= {"noaug", "demos1", "demos50", "actions"}  # of the claims
+# Fields that do not change what a run learns.
+_INCIDENTAL = {"seed", "total_frames", "num_eval_episodes", "eval_every_frames"}
+_INCIDENTAL |= {"checkpoint_every_frames", "video_every_evals", "policy_tau"}
 
 
 def kind_of(name: str, config: Mapping[str, Any]) -> str:
@@ -63,10 +70,34 @@ def kind_of(name: str, config: Mapping[str, Any]) -> str:
         return "other"
     if config.get("observation", "pixels") == "state":
         return "state"
-    if method in ("psil", "drqv2"):
+    if method not in methods.known():  # P-DAC on components, before that was a field
+        return "earlier pdac"
+    if method == "drqv2" or is_of_preset(config):
         return method
-    components = config.get("discriminator", {}).get("num_components", 0)
-    return "components" if components or "components" in name else "features"
+    return f"earlier {method}"
+
+
+def is_of_preset(config: Mapping[str, Any]) -> bool:
+    """Returns whether a run was made with what is the small preset today.
+
+    Fields that its version did not have are taken for their defaults.
+    """
+    method, task = config["method"], config["task"]
+    preset = _flat(tiny.get_config(f"{method},{task}").to_dict())
+    fields = _flat(default_config(method, task).to_dict()) | _flat(config)
+    return all(fields[name] == value for name, value in preset.items())
+
+
+def _flat(fields: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Returns the fields of all sections by full name, without incidental ones."""
+    found = {}
+    for name, value in fields.items():
+        if isinstance(value, Mapping):
+            found |= _flat(value, f"{prefix}{name}.")
+        elif name not in _INCIDENTAL:
+            # JSON has no tuples.
+            found[prefix + name] = list(value) if isinstance(value, tuple) else value
+    return found
 
 
 def plot_overview() -> None:
