@@ -37,14 +37,6 @@ METHOD = methods.Method(
                 0,
                 1024,
             ),
-            "input_scale": methods.Field(
-                1.0,
-                "factor on what it judges; below 1 its logits saturate less, and "
-                "rewards are divided by it; 1 in the paper",
-                0,
-                1e3,
-                positive=True,
-            ),
         }
     },
     sees_actions="discriminator.sees_actions",
@@ -72,20 +64,14 @@ def make_rewarder(
     batch_size: int,
     sees_actions: bool,
     num_components: int,
-    input_scale: float,
 ) -> Rewarder:
     """Returns the rewarder of P-DAC.
 
-        r = logit D(s e) / s,    s = 1 in the paper
+        r = logit D(e)
 
     where D, see `update_discriminator`, judges critic-trunk features e of augmented
     observations, without gradient into encoder or trunk. log D - log(1 - D), the
     paper's reward, is the logit itself, and only the logit stays finite in float32.
-
-    The penalty holds logits to a slope of s along e. With s = 1 samples that D tells
-    apart for certain stop teaching it, and all bad poses are rewarded alike; with a
-    small s logits stay near 0, where cross-entropy is linear, and r approaches the
-    potential of the Wasserstein distance, which ranks them (Gulrajani et al. 2017).
 
     With `num_components`, e is `codes.encode` of observations without augmentation. It
     does not change, so what a reward means does not either, and it knows of the whole
@@ -98,7 +84,6 @@ def make_rewarder(
       gradient_penalty: its weight.
       batch_size: expert samples, and agent samples, in an update.
       sees_actions: whether actions are appended to the features: D(o_t, a_t).
-      input_scale: s.
       num_components: of each frame; 0, the paper's: the critic's features. State
         vectors have no code, and their features are judged.
 
@@ -112,8 +97,9 @@ def make_rewarder(
     encode = functools.partial(codes.encode, frame_stack=agent.frame_stack)
 
     def inputs(features: Array, action: Array) -> Array:
-        seen = [features, action] if sees_actions else [features]
-        return input_scale * jnp.concatenate(seen, axis=-1)
+        if not sees_actions:
+            return features
+        return jnp.concatenate([features, action], axis=-1)
 
     def logits(params: Params, x: Array) -> Array:
         return apply(discriminator, params, x)
@@ -200,7 +186,7 @@ def make_rewarder(
         features = features_of(state, learner, episode.frames)
         # r(o_{t+1}), as in the reference; with actions the pair is (o_t, a_t).
         judged = features[:-1] if sees_actions else features[1:]
-        return logits(state.params, inputs(judged, episode.actions)) / input_scale
+        return logits(state.params, inputs(judged, episode.actions))
 
     return Rewarder(
         rewards,

@@ -43,7 +43,6 @@ PDAC = pdac.make_rewarder(
     batch_size=4,
     sees_actions=False,
     num_components=0,
-    input_scale=1.0,
 )
 PSIL = psil.make_rewarder(
     AGENT,

@@ -34,7 +34,6 @@ SETTINGS = {
         "batch_size": 8,
         "sees_actions": True,
         "num_components": 0,
-        "input_scale": 0.5,
     },
     "psil": {
         "cost": "cosine",
