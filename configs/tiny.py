@@ -1,6 +1,6 @@
 r"""The preset that learns on two CPU cores, the same as `--config=tiny:METHOD,TASK`.
 
-    python -m jaxil.launch --config=configs/tiny.py:pdac,ball_in_cup_catch \
+    python -m jaxil.launch --config=configs/tiny.py:pdac,cartpole_swingup \
         --workdir=runs/tiny
 """
 

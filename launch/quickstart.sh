@@ -2,7 +2,7 @@
 # Sets up jaxil on this machine, then trains an agent.
 #
 #   bash launch/quickstart.sh
-#       imitates ten episodes of ball_in_cup_catch from pixels, with small networks that
+#       imitates ten episodes of cartpole_swingup from pixels, with small networks that
 #       learn on two CPU cores, into runs/quickstart
 #   bash launch/quickstart.sh --config.seed=1 --workdir=runs/seed1
 #       the same with other settings
@@ -50,7 +50,6 @@ if ! has_flag --config "$@" && ! has_flag --help "$@" && ! has_flag -h "$@"; the
     say "Training into $root/runs/quickstart: watch learning_curve.png, videos/ and" \
       "eval.csv there. Ctrl-C saves and stops; rerun the same command to resume."
   fi
-  set -- --config=configs/tiny.py:pdac,ball_in_cup_catch \
-    --config.total_frames=100000 "$@"
+  set -- --config=configs/tiny.py:pdac,cartpole_swingup "$@"
 fi
 exec "$venv/bin/python" -m jaxil.launch "$@"

@@ -117,11 +117,8 @@ def test_other_pythons_are_refused(project):
     assert "PYTHON=PATH" in printed
 
 
-_CONFIG = (
-    "--config=configs/tiny.py:pdac,ball_in_cup_catch",
-    "--config.total_frames=100000",
-)
-_DEFAULTS = *_CONFIG, "--workdir=runs/quickstart"
+_CONFIG = "--config=configs/tiny.py:pdac,cartpole_swingup"
+_DEFAULTS = _CONFIG, "--workdir=runs/quickstart"
 
 
 @pytest.mark.parametrize(
@@ -129,7 +126,7 @@ _DEFAULTS = *_CONFIG, "--workdir=runs/quickstart"
     [
         ((), _DEFAULTS),
         (("--config.seed=1",), (*_DEFAULTS, "--config.seed=1")),
-        (("--workdir", "runs/x"), (*_CONFIG, "--workdir", "runs/x")),
+        (("--workdir", "runs/x"), (_CONFIG, "--workdir", "runs/x")),
         (("--config=a.py", "--workdir=b"), ("--config=a.py", "--workdir=b")),
         (("--config", "a.py"), ("--config", "a.py")),
     ],

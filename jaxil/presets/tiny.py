@@ -1,6 +1,6 @@
 """The preset that learns on two CPU cores: `--config=tiny:METHOD,TASK`.
 
-    jaxil train --config=tiny:pdac,ball_in_cup_catch --workdir=runs/tiny
+    jaxil train --config=tiny:pdac,cartpole_swingup --workdir=runs/tiny
 
 The paper's methods with smaller images, networks and batches, and rendering without
 shadows. Other deviations from the paper:
@@ -50,7 +50,7 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
             Fault(
                 "--config",
                 "lacks the task",
-                "write METHOD,TASK, such as tiny:pdac,ball_in_cup_catch",
+                "write METHOD,TASK, such as tiny:pdac,cartpole_swingup",
                 f"tiny:{argument}",
             )
         )
