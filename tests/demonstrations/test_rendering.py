@@ -13,7 +13,7 @@ import time
 import numpy as np
 import pytest
 
-from jaxil.demonstrations import rendering
+from jaxil.demonstrations import loading, rendering, states
 from jaxil.environments.suite import make_environment
 from tests.commands import ROOT
 from tests.processes import wait_until_gone
@@ -229,3 +229,22 @@ def test_processes_are_started_where_they_pay(pays, alone, monkeypatch):
     monkeypatch.setattr(rendering, "_MIN_PARALLEL_PIXELS", num_pixels + (not pays))
     np.testing.assert_array_equal(observe(processes=None), alone[0])
     assert started == [2] * pays
+
+
+def test_the_expert_is_seen_from_the_agents_camera():
+    task, seen = "cartpole_swingup", {}
+    stored = states.read_states(states.shipped_path(task), num_episodes=1)
+    frame = 25 * stored.metadata["action_repeat"]
+    arrays = stored.simulator_states(slice(25, 26))
+    state = {name: array[0, 0] for name, array in arrays.items()}
+    for camera in ("", "fixed", "lookatcart"):  # in one cache
+        settings = {"task": task, "camera": camera, "image_size": SIZE}
+        settings["render_quality"] = "fast"
+        expert = loading.load(num_episodes=1, action_repeat=frame, **settings)
+        with make_environment(seed=0, **settings) as environment:
+            environment.reset()
+            environment.set_simulator_state(**state)
+            seen[camera] = environment.single_observation()
+        np.testing.assert_array_equal(expert.frames[0, 1], seen[camera])
+    np.testing.assert_array_equal(seen[""], seen["fixed"])
+    assert np.mean(seen[""] != seen["lookatcart"]) > 0.5
