@@ -9,7 +9,7 @@ of it, and what it learns from is sampled here.
 import numpy as np
 
 from jaxil import presets
-from jaxil.demonstrations import loading, sampling
+from jaxil.demonstrations import sampling
 from jaxil.environments.evaluation import evaluate
 from jaxil.machine import startup
 from jaxil.training import agent as agents
@@ -27,9 +27,8 @@ def main() -> dict[str, float]:
     config.discriminator.update(hidden_dim=16, batch_size=8)
     config.demonstrations.num_episodes = 1
     environment = assembly.training_environment(config)
-    demonstrations = loading.load(
-        task=config.task, num_episodes=1, action_repeat=20, image_size=24
-    )
+    demonstrations = assembly.load_demonstrations(config)
+    assert demonstrations is not None  # P-DAC imitates
     agent = agents.make_agent(config, environment, demonstrations)
     experts = agents.expert_episodes(agent.rewarder, demonstrations)
     replay = assembly.make_replay(config, environment)
