@@ -21,8 +21,8 @@ shadows. Other deviations from the paper:
   first and not with the second. On `ball_in_cup_catch` it is the other way round: a
   small ball is lost in components (launch/results/README.md, "Learning: the ladder").
 - cartpole_swingup is seen by the camera that follows the cart. DrQ-v2's shows the pole
-  one pixel wide, and not at the rail's ends: agents needed twice as many frames, and
-  then dropped the pole again and again. Pixels of another renderer may need
+  one pixel wide, and not at the rail's ends: agents needed more frames, and then
+  dropped the pole again and again. Pixels of another renderer may need
   `--config.camera=0`.
 - cartpole_swingup repeats actions 4 times: with 2, a pole at 1 rad/s moves a quarter of
   a pixel between frames, which hides its speed, and agents only learned to spin it;
