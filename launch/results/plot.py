@@ -47,8 +47,8 @@ class Kind(NamedTuple):
 _KINDS = {
     "pdac": Kind("P-DAC, today's small preset", "#0072B2", width=2.2),
     "psil": Kind("P-SIL, today's small preset", "#D55E00", width=2.2),
-    "earlier pdac": Kind("P-DAC, other settings", "#56B4E9"),
-    "earlier psil": Kind("P-SIL, other settings", "#E69F00"),
+    "pdac, changed": Kind("P-DAC, other settings", "#56B4E9"),
+    "psil, changed": Kind("P-SIL, other settings", "#E69F00"),
     "drqv2": Kind("true reward", "#009E73"),
     "state": Kind("imitation from state vectors", "#999999", "--"),
     "other": Kind("experiments and controls", "#cccccc"),
@@ -71,10 +71,10 @@ def kind_of(name: str, config: Mapping[str, Any]) -> str:
     if config.get("observation", "pixels") == "state":
         return "state"
     if method not in methods.known():  # P-DAC on components, before that was a field
-        return "earlier pdac"
+        return "pdac, changed"
     if method == "drqv2" or is_of_preset(config):
         return method
-    return f"earlier {method}"
+    return f"{method}, changed"
 
 
 def is_of_preset(config: Mapping[str, Any]) -> bool:
