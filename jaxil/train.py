@@ -343,8 +343,8 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
             way_out = "Rerun the same command to resume"
             raise EnvironmentsFailed(f"{error}\n{newest}. {way_out}") from error
         run.finish()
+    ended, way_on = "finished", "a larger --config.total_frames trains on"
     if run.stop_asked:
-        screen.say(
-            f"stopped at frame {run.frame}, saved; rerun the same command to resume"
-        )
+        ended, way_on = "stopped", "rerun the same command to resume"
+    screen.say(f"{ended} at frame {run.frame}, saved; {way_on}")
     return not run.stop_asked

@@ -127,6 +127,7 @@ def test_outlives_its_pipe_and_resumes_bit_for_bit_after_a_kill(unbroken, tmp_pa
     resumed = call("launch", *small_run("pdac", tmp_path), *_REFRESHED)
     assert resumed.returncode == 0, resumed.stderr
     assert "resuming from the checkpoint of frame 2000" in resumed.stderr
+    assert "finished at frame" in resumed.stderr
     expected, got = (read_csv(each / "train.csv") for each in (unbroken, tmp_path))
     assert list(expected) == list(got)
     for column in expected:
