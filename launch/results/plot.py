@@ -57,7 +57,7 @@ _KINDS = {
 _EXPERIMENTS = {"pca32", "pca64", "dynamics", "cloning1", "cloning3", "cloning10"}
 _EXPERIMENTS |= {"beside", "layernorm", "centred", "std10k", "greedy", "reconstruction"}
 _EXPERIMENTS |= {"lowrate", "scaled", "gradients", "nstep3", "decay"}
-_EXPERIMENTS |= {"noaug", "demos1", "demos50", "actions"}  # of the claims
+_EXPERIMENTS |= {"noaug", "demos1", "demos50", "actions", "time"}  # of the claims
 # Fields that do not change what a run learns.
 _INCIDENTAL = {"seed", "total_frames", "num_eval_episodes", "eval_every_frames"}
 _INCIDENTAL |= {"checkpoint_every_frames", "video_every_evals", "policy_tau"}
@@ -66,11 +66,12 @@ _INCIDENTAL |= {"checkpoint_every_frames", "video_every_evals", "policy_tau"}
 def kind_of(name: str, config: Mapping[str, Any]) -> str:
     """Returns the kind of a run, by its folder and its settings."""
     method = config["method"]
-    if _EXPERIMENTS & set(name.split("_")) or method in ("zero", "bc"):
+    is_known = method in methods.known()
+    if _EXPERIMENTS & set(name.split("_")) or (is_known and method not in _KINDS):
         return "other"
     if config.get("observation", "pixels") == "state":
         return "state"
-    if method not in methods.known():  # P-DAC on components, before that was a field
+    if not is_known:  # P-DAC on components, before that was a field
         return "pdac, changed"
     if method == "drqv2" or is_of_preset(config):
         return method
