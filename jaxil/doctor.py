@@ -64,8 +64,14 @@ def examine(config: Any) -> Iterator[Finding]:
 
 def versions(_: Any) -> Iterator[Finding]:
     """Compares the versions of packages with those that jaxil requires."""
+    try:
+        required = importlib.metadata.requires("jaxil") or []
+    except importlib.metadata.PackageNotFoundError:  # run from a source tree
+        advice = "pip install ., which also installs what it requires"
+        yield Finding("warning", "jaxil", devices.NOT_INSTALLED, advice)
+        required = []
     good = []
-    for text in (*(importlib.metadata.requires("jaxil") or ()), _JAXLIB):
+    for text in (*required, _JAXLIB):
         requirement = Requirement(text)
         if requirement.marker is not None:  # of an extra
             continue

@@ -11,7 +11,7 @@ from jaxil import doctor
 from jaxil.demonstrations import states
 from jaxil.environments import pixel_environment, suite
 from jaxil.errors import UsageError
-from jaxil.machine import devices, memory
+from jaxil.machine import devices, memory, provenance
 
 
 @pytest.fixture(autouse=True)
@@ -92,6 +92,33 @@ def test_a_missing_package_is_a_fault(monkeypatch):
     monkeypatch.setattr(importlib.metadata, "version", missing)
     finding = one(doctor.versions(None), "mujoco")
     assert (finding.level, finding.value) == ("fault", "missing")
+
+
+def test_a_source_tree_that_is_not_installed(monkeypatch):
+    """On the module path alone, jaxil has no version."""
+    real = importlib.metadata.Distribution.from_name
+
+    def from_name(name):
+        if name == "jaxil":
+            raise importlib.metadata.PackageNotFoundError(name)
+        return real(name)
+
+    monkeypatch.setattr(importlib.metadata.Distribution, "from_name", from_name)
+    finding = one(doctor.versions(None), "jaxil")
+    assert (finding.level, finding.value) == ("warning", "not installed")
+    assert "jaxlib" in one(doctor.versions(None), "packages").value
+    versions = provenance.describe("egl", native=False)["versions"]
+    assert versions["jaxil"] == "not installed"
+    assert versions["jax"] == real("jax").version
+    metadata = states.new_metadata(
+        task="cartpole_swingup",
+        action_repeat=2,
+        seed=0,
+        first_episode=0,
+        expert="none",
+        rewards=np.zeros((1, 3)),
+    )
+    assert metadata["versions"]["jaxil"] == "not installed"
 
 
 def test_missing_gl_libraries(monkeypatch):

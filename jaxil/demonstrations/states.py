@@ -11,7 +11,6 @@ renderer.
 """
 
 import hashlib
-import importlib.metadata
 import json
 import os
 import pathlib
@@ -22,6 +21,7 @@ import numpy as np
 from jaxil.environments import suite
 from jaxil.errors import printable
 from jaxil.files import archive
+from jaxil.machine import devices
 
 FORMAT = "jaxil-demonstrations"
 VERSION = 1
@@ -100,7 +100,7 @@ def new_metadata(
         "camera": suite.camera_of(task),
         "versions": {
             **suite.simulator_versions(),
-            "jaxil": importlib.metadata.version("jaxil"),
+            "jaxil": devices.version("jaxil") or devices.NOT_INSTALLED,
         },
         "seed": seed,
         "first_episode": first_episode,

@@ -13,6 +13,8 @@ from typing import Any
 
 from jaxil.errors import Fault, UsageError
 
+NOT_INSTALLED = "not installed"
+
 
 def has_cuda_device() -> bool:
     """Returns whether CUDA can see an NVIDIA device."""

@@ -1,6 +1,5 @@
 """The machine and its software, for a run's config.json."""
 
-import importlib.metadata
 import platform
 from typing import Any
 
@@ -13,11 +12,14 @@ _PACKAGES = (
 
 
 def describe(gl_name: str, *, native: bool) -> dict[str, Any]:
-    """Returns versions, device, convolutions ("native" for those in C) and renderer."""
+    """Returns versions, device, convolutions ("native" for those in C) and renderer.
+
+    jaxil itself has no version where it runs from a source tree that is not installed.
+    """
     return {
         "versions": {
             "python": platform.python_version(),
-            **{name: importlib.metadata.version(name) for name in _PACKAGES},
+            **{n: devices.version(n) or devices.NOT_INSTALLED for n in _PACKAGES},
         },
         "device": devices.device_name(),
         "convolutions": "native" if native else "xla",
