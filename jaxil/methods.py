@@ -110,6 +110,10 @@ DISCRIMINATOR = {
         128, "expert samples, and agent samples, in an update; 128 in ROT", 1, 65_536
     ),
 }
+CLONING = {
+    "batch_size": Field(128, "expert samples; 128 in ROT", 1, 65_536),
+    "std": Field(0.1, "of the policy whose likelihood is raised; 0.1", 1e-6, 10.0),
+}
 DISCRIMINATOR_METRICS = (
     "discriminator/loss",
     "discriminator/penalty",

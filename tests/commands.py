@@ -45,6 +45,7 @@ _OWN = {
     "psil": ("sinkhorn.target_update_steps=150", "sinkhorn.num_iterations=10"),
     "sil": ("discriminator.batch_size=8", "sinkhorn.num_iterations=10"),
     "bc": ("cloning.batch_size=8",),
+    "bco": ("cloning.batch_size=8", "inverse_model.hidden_dim=16"),
 }
 
 

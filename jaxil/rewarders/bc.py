@@ -24,14 +24,7 @@ METHOD = methods.Method(
     about="the expert's actions, by behavioural cloning",
     colour="#009E73",
     rank=5,
-    sections={
-        "cloning": {
-            "batch_size": methods.Field(128, "expert samples; 128 in ROT", 1, 65_536),
-            "std": methods.Field(
-                0.1, "of the policy whose likelihood is raised; 0.1", 1e-6, 10.0
-            ),
-        }
-    },
+    sections={"cloning": methods.CLONING},
     make_update_step="make_update_step",
     sees_actions=True,
     plays=False,
@@ -71,27 +64,47 @@ def make_update_step(learner: Learner, *, batch_size: int, std: float) -> Update
             jax.random.fold_in(state.key, state.num_updates),
             padding=learner.shift_padding,
         )
-        encoder, actor, _ = learner.networks
-
-        def loss(params: tuple[Params, Params]) -> tuple[Array, Array]:
-            representation = apply(encoder, params[0], observation)
-            pre_tanh = apply(actor, params[1], representation)
-            negative = losses.cloning_loss(jnp.tanh(pre_tanh), expert.action, std=std)
-            penalty = losses.saturation_penalty(pre_tanh)
-            return negative + learner.pre_tanh_penalty * penalty, pre_tanh
-
-        (value, pre_tanh), gradients = jax.value_and_grad(loss, has_aux=True)(
-            (state.encoder.params, state.actor.params)
-        )
-        optimiser = learner.optimiser
-        state = state.replace(
-            encoder=apply_gradients(state.encoder, gradients[0], optimiser),
-            actor=apply_gradients(state.actor, gradients[1], optimiser),
-            num_updates=state.num_updates + 1,
-        )
-        return state, {
-            "actor/loss": value,
-            "actor/pre_tanh": jnp.mean(jnp.abs(pre_tanh)),
-        }
+        return clone(learner, state, observation, expert.action, std=std)
 
     return cloning_step
+
+
+def clone(
+    learner: Learner,
+    state: TrainState,
+    observation: Array,
+    action: Array,
+    *,
+    std: float,
+) -> tuple[TrainState, Metrics]:
+    """Steps encoder and actor towards `action` where `observation` is seen.
+
+    Args:
+      learner: networks and hyperparameters.
+      state: critic and rewarder are left as they are.
+      observation: augmented. Shape [B, H, W, C] or [B, S].
+      action: shape [B, A].
+      std: see `losses.cloning_loss`.
+    """
+    encoder, actor, _ = learner.networks
+
+    def loss(params: tuple[Params, Params]) -> tuple[Array, Array]:
+        representation = apply(encoder, params[0], observation)
+        pre_tanh = apply(actor, params[1], representation)
+        negative = losses.cloning_loss(jnp.tanh(pre_tanh), action, std=std)
+        penalty = losses.saturation_penalty(pre_tanh)
+        return negative + learner.pre_tanh_penalty * penalty, pre_tanh
+
+    (value, pre_tanh), gradients = jax.value_and_grad(loss, has_aux=True)(
+        (state.encoder.params, state.actor.params)
+    )
+    optimiser = learner.optimiser
+    state = state.replace(
+        encoder=apply_gradients(state.encoder, gradients[0], optimiser),
+        actor=apply_gradients(state.actor, gradients[1], optimiser),
+        num_updates=state.num_updates + 1,
+    )
+    return state, {
+        "actor/loss": value,
+        "actor/pre_tanh": jnp.mean(jnp.abs(pre_tanh)),
+    }

@@ -1,0 +1,31 @@
+"""The inverse model: which action led from one observation to the next."""
+
+from typing import Any
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jax import Array
+
+from jaxil.networks.discriminator import Embedding
+from jaxil.networks.layers import MLP
+
+
+class InverseModel(nn.Module):
+    """Two observations in turn, each embedded by the same encoder, to an action.
+
+    Source: Torabi et al. 2018, arXiv:1805.01954, sec. 4.1, with an encoder and a trunk
+    like the agent's in front, since observations are pixels here.
+    """
+
+    encoder: Any
+    feature_dim: int
+    hidden_dim: int
+    action_dim: int
+
+    @nn.compact
+    def __call__(self, observation: Array, successor: Array) -> Array:
+        """Maps twice [B, H, W, C] to actions [B, A], in [-1, 1]."""
+        embed = Embedding(self.encoder, self.feature_dim)
+        features = [embed(observation), embed(successor)]
+        mlp = MLP(self.hidden_dim, self.action_dim)
+        return jnp.tanh(mlp(jnp.concatenate(features, axis=-1)))

@@ -1,0 +1,149 @@
+"""BCO: its inverse model sees actions in the video, and the policy copies them."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from jaxil.learner.policy import make_mean_action
+from jaxil.learner.rewarder import AgentSpec, Spec
+from jaxil.learner.update import Learner, init_train_state
+from jaxil.maths import augmentation
+from jaxil.maths.types import Batch, ExpertBatch
+from jaxil.rewarders import bco
+from tests.tiny_agent import make_episode, make_tiny_networks, random_frames
+
+SETTINGS = {"batch_size": 32, "std": 0.1, "hidden_dim": 32, "learning_rate": 3e-3}
+STATE_DIM, SIDE = 3, 8
+
+
+@functools.cache
+def make_learner(observation="state", shift_padding=0):
+    networks = make_tiny_networks(
+        feature_dim=16, hidden_dim=32, observation=observation
+    )
+    agent = AgentSpec(networks, 16, 1, shift_padding)
+    return Learner(
+        networks=networks,
+        rewarder=bco.make_rewarder(agent, **SETTINGS),
+        learning_rate=3e-3,
+        critic_target_tau=0.01,
+        noise_clip=0.3,
+        shift_padding=shift_padding,
+        pre_tanh_penalty=0.0,
+        exploration_std=optax.constant_schedule(0.1),
+    )
+
+
+@functools.cache
+def make_step(observation="state", shift_padding=0):
+    learner = make_learner(observation, shift_padding)
+    return jax.jit(bco.make_update_step(learner, **SETTINGS))
+
+
+def make_state(observation="state", shift_padding=0):
+    shape = (STATE_DIM,) if observation == "state" else (SIDE, SIDE, 3)
+    dtype = np.float32 if observation == "state" else np.uint8
+    spec = Spec(2, 16, num_demonstrations=1, expert_steps=4, observation_shape=shape)
+    learner = make_learner(observation, shift_padding)
+    return init_train_state(learner, jax.random.key(0), np.zeros(shape, dtype), spec)
+
+
+def moved(observation, action):
+    """A world in which an action moves two of three coordinates."""
+    return observation + np.pad(action, ((0, 0), (1, 0))).astype(np.float32)
+
+
+def play(rng, size=32):
+    """The agent's transitions: states and actions are uniform."""
+    observation = rng.uniform(-1, 1, (size, STATE_DIM)).astype(np.float32)
+    action = rng.uniform(-1, 1, (size, 2)).astype(np.float32)
+    unread = np.full(size, np.nan, np.float32)
+    successor = moved(observation, action)
+    return Batch(observation, action, unread, unread, observation, successor)
+
+
+def expert_actions(observation):
+    """What the expert does: it goes back to the middle."""
+    return -0.8 * observation[:, 1:]
+
+
+def demonstrations(rng, size=32):
+    """The expert's transitions; its actions are not told."""
+    observation = rng.uniform(-1, 1, (size, STATE_DIM)).astype(np.float32)
+    successor = moved(observation, expert_actions(observation))
+    untold = np.full((size, 2), np.nan, np.float32)
+    return ExpertBatch(observation, untold, successor)
+
+
+def test_the_policy_copies_actions_that_nobody_told_it():
+    rng, state, step = np.random.default_rng(0), make_state(), make_step()
+    before = make_state()
+    for _ in range(1000):
+        state, metrics = step(state, play(rng), demonstrations(rng))
+    assert metrics["inverse_model/error"] < 0.02  # of a mean square of 0.67
+    seen = demonstrations(rng).observation
+    copied = make_mean_action(make_learner().networks)(
+        state.encoder.params, state.actor.params, seen
+    )
+    error = np.mean(np.square(copied - expert_actions(seen)))
+    assert error < 0.1 * np.mean(np.square(expert_actions(seen)))
+    assert int(state.num_updates) == 1000
+    for name in ("critic", "target_critic"):
+        jax.tree.map(
+            np.testing.assert_array_equal, getattr(state, name), getattr(before, name)
+        )
+
+
+def test_the_inverse_model_learns_from_the_agent_alone():
+    """Other demonstrations change the policy, and nothing of the inverse model."""
+    batch, step = play(np.random.default_rng(0)), make_step()
+    one, _ = step(make_state(), batch, demonstrations(np.random.default_rng(1)))
+    other, _ = step(make_state(), batch, demonstrations(np.random.default_rng(2)))
+    jax.tree.map(np.testing.assert_array_equal, one.rewarder, other.rewarder)
+    different = jax.tree.map(
+        lambda x, y: bool(np.any(x != y)), one.actor.params, other.actor.params
+    )
+    assert any(jax.tree.leaves(different))
+
+
+def test_both_observations_of_a_pair_are_shifted_alike(monkeypatch):
+    """If nothing moves, the inverse model must see that nothing moves."""
+    seen = []
+    real = augmentation.augment
+
+    def watched(observation, key, *, padding):
+        seen.append(real(observation, key, padding=padding))
+        return seen[-1]
+
+    monkeypatch.setattr(augmentation, "augment", watched)
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(0, 256, (32, SIDE, SIDE, 3), dtype=np.uint8)
+    action = np.zeros((32, 2), np.float32)
+    unread = np.full(32, np.nan, np.float32)
+    batch = Batch(pixels, action, unread, unread, pixels, pixels)
+    step = bco.make_update_step(make_learner("pixels", 2), **SETTINGS)
+    step(make_state("pixels", 2), batch, ExpertBatch(pixels, action, pixels))
+    pair = next(x for x in seen if x.shape[-1] == 6)
+    np.testing.assert_array_equal(pair[..., :3], pair[..., 3:])
+    assert np.any(pair[..., :3] != pixels)
+
+
+def test_asks_for_successors_and_refuses_another_number_of_samples():
+    rewarder = make_learner().rewarder
+    assert rewarder.expert_batch_size == 32
+    assert rewarder.samples_successors
+    rng = np.random.default_rng(0)
+    with pytest.raises(AssertionError):
+        make_step()(make_state(), play(rng), demonstrations(rng, size=31))
+    with pytest.raises(AssertionError):
+        make_step()(make_state(), play(rng)._replace(successor=None), None)
+
+
+def test_rewards_nothing():
+    episode = make_episode(random_frames(0, 6))
+    rewards = make_learner().rewarder.rewards((), None, episode, None)
+    np.testing.assert_array_equal(rewards, jnp.zeros(5))
