@@ -47,8 +47,8 @@ has_flag() { # name, words
 if ! has_flag --config "$@" && ! has_flag --help "$@" && ! has_flag -h "$@"; then
   if ! has_flag --workdir "$@"; then
     set -- --workdir=runs/quickstart "$@"
-    say "Training into $root/runs/quickstart: watch learning_curve.png, videos/ and" \
-      "eval.csv there. Ctrl-C saves and stops; rerun the same command to resume."
+    say "Folder of the run: $root/runs/quickstart (learning_curve.png, videos/, eval.csv)." \
+      "Ctrl-C saves and stops; rerun the same command to resume."
   fi
   set -- --config=configs/tiny.py:pdac,cartpole_swingup "$@"
 fi
