@@ -30,8 +30,8 @@ shadows. Other deviations from the paper:
 - cartpole_swingup repeats actions 4 times: with 2, a pole at 1 rad/s moves a quarter of
   a pixel between frames, which hides its speed, and agents only learned to spin it;
   with 8, none learned to balance it. P-DAC's gradient penalty has weight 1 there.
-- Learning rates fall on cartpole_swingup and walker_walk: agents that walk keep falling
-  over at the first rate (457 of 961 at 500k frames), and not at the last.
+- Learning rates fall on cartpole_swingup and walker_walk: agents that walk fall over
+  again and again at the first rate (457 of 961 at 500k frames), and less at the last.
 """
 
 from jaxil import config as jaxil_config
