@@ -6,10 +6,12 @@ r"""Trains one agent: imitation from video, or DrQ-v2 on the true reward.
 Rerun the same command to resume. `python -m jaxil.launch` is the same command.
 """
 
+import pathlib
+
 from absl import flags
 
 from jaxil import command
-from jaxil.errors import UsageError
+from jaxil.errors import Fault, UsageError
 
 
 def main(argv: list[str]) -> int:
@@ -18,7 +20,12 @@ def main(argv: list[str]) -> int:
     from jaxil.machine import screen, startup
     from jaxil.training import workdir
 
-    folder = workdir.from_flag(values.workdir)
+    faults: list[Fault | str] = []
+    folder = pathlib.Path()
+    try:
+        folder = workdir.from_flag(values.workdir)
+    except UsageError as error:
+        faults += error.faults
     # Before jax and MuJoCo are imported, which the imports below do.
     screen.say(startup.prepare())
 
@@ -29,7 +36,9 @@ def main(argv: list[str]) -> int:
     from jaxil.training import assembly
 
     config = values.config
-    faults = [*assembly.problems(config), *workdir.problems(folder, config)]
+    if not faults:
+        faults += workdir.problems(folder, config)
+    faults += assembly.problems(config)
     if faults:
         raise UsageError(faults)
     devices.device_name()  # a wrong JAX_PLATFORMS is said before jax is needed

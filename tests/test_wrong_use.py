@@ -106,6 +106,13 @@ def test_wrong_command_lines(flags, expected):
     assert expected in finished.stderr
 
 
+def test_a_missing_folder_and_a_wrong_task_come_in_one_message():
+    finished = call("launch", "--config=configs/tiny.py:bco,walker_wlak")
+    assert finished.returncode == 2
+    assert "--workdir is missing" in finished.stderr
+    assert "walker_walk" in finished.stderr
+
+
 def test_demonstrations_are_checked_before_anything_starts(tmp_path):
     config = jaxil_config.default_config("pdac", "walker_walk")
     cut_off = tmp_path / "cut.npz"
