@@ -145,5 +145,6 @@ def test_asks_for_successors_and_refuses_another_number_of_samples():
 
 def test_rewards_nothing():
     episode = make_episode(random_frames(0, 6))
-    rewards = make_learner().rewarder.rewards((), None, episode, None)
+    params = make_state().params
+    rewards = make_learner().rewarder.rewards((), params, episode, None)
     np.testing.assert_array_equal(rewards, jnp.zeros(5))
