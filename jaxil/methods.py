@@ -124,6 +124,12 @@ RELABELS = Field(
     True,
     "rewards are recomputed for every batch; False: stored, see reward_refresh_steps",
 )
+COMPONENTS = Field(
+    0,
+    "principal components of each frame that are judged; 0, the paper's: features",
+    0,
+    1024,
+)
 SINKHORN = {
     "cost": Field("cosine", "between features", choices=("cosine", "euclidean")),
     "alignment": Field(

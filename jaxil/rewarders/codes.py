@@ -19,14 +19,14 @@ _SMALLEST_SCALE = 1e-3  # below it is rounding, which must not be magnified
 class FrameCode(struct.PyTreeNode):
     """Principal components of demonstrations and of play before the first update.
 
-    Fitted again by each episode until `is_fixed`, since a discriminator needs inputs
-    that keep their meaning. Play adds poses that no demonstration has.
+    Fitted again by each episode until `is_fixed`, since what judges needs inputs that
+    keep their meaning. Play adds poses that no demonstration has.
 
     Attributes:
       mean: of demonstrations' frames, in [0, 1]. Shape [P], with P = H W 3.
       sketch: see `components.merge`. Shape [K, P].
       num_rows: frames that it was fitted on. Shape [].
-      is_fixed: whether an update has used it. Shape [], bool.
+      is_fixed: whether rewards or updates have used it. Shape [], bool.
     """
 
     mean: Array

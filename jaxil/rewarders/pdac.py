@@ -30,13 +30,7 @@ METHOD = methods.Method(
         "discriminator": {
             **methods.DISCRIMINATOR,
             "sees_actions": methods.Field(False, "appends actions to the features"),
-            "num_components": methods.Field(
-                0,
-                "principal components of each frame that it judges; 0, the paper's: "
-                "the critic's features",
-                0,
-                1024,
-            ),
+            "num_components": methods.COMPONENTS,
         }
     },
     sees_actions="discriminator.sees_actions",

@@ -2,6 +2,8 @@
 
 from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, Rewarder
+from jaxil.networks.encoder import PixelEncoder
+from jaxil.rewarders.coded import make_coded_rewarder
 from jaxil.rewarders.matching import make_matching
 from jaxil.rewarders.targets import make_target_rewarder
 
@@ -11,7 +13,13 @@ METHOD = methods.Method(
     about="optimal transport to the closest demonstration",
     colour="#D55E00",
     rank=2,
-    sections={"sinkhorn": {**methods.SINKHORN, **methods.TARGETS}},
+    sections={
+        "sinkhorn": {
+            **methods.SINKHORN,
+            **methods.TARGETS,
+            "num_components": methods.COMPONENTS,
+        }
+    },
     metrics=("sinkhorn/scale",),
     variations=(
         methods.Variation("sinkhorn.cost", "cosine", "{}"),
@@ -29,14 +37,16 @@ def make_rewarder(
     num_iterations: int,
     target_update_steps: int,
     return_scale: float,
+    num_components: int,
 ) -> Rewarder:
     """Returns the rewarder of P-SIL.
 
         r_t = - scale * sum_n C_tn P_tn,    C = cosine distance, P = Sinkhorn plan
 
-    between features of target copies of the actor's trunk on the encoder, to the
-    demonstration that is cheapest to reach. For the arguments see `make_matching` and
-    `make_target_rewarder`.
+    between features of target copies of the actor's trunk on the encoder, or with
+    `num_components` between codes of the pixels, to the demonstration that is cheapest
+    to reach. State vectors have no code, and their features are compared. For the
+    arguments see `make_matching`, `make_target_rewarder` and `make_coded_rewarder`.
 
     Source: Cohen et al. 2021, sec. 3.1, eqs. (1) to (5); epsilon, iterations and
     the copied trunk, which the paper leaves out, from siddhanthaldar/ROT.
@@ -44,6 +54,14 @@ def make_rewarder(
     matching = make_matching(
         cost=cost, alignment=alignment, epsilon=epsilon, num_iterations=num_iterations
     )
+    if num_components and isinstance(agent.networks.encoder, PixelEncoder):
+        return make_coded_rewarder(
+            agent,
+            num_components=num_components,
+            compare=matching.rewards,
+            plan=matching.closest_plan,
+            return_scale=return_scale,
+        )
     return make_target_rewarder(
         agent,
         compare=matching.rewards,

@@ -1,8 +1,5 @@
 """What methods share that compare episodes under target copies of the actor's trunk."""
 
-from collections.abc import Callable
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -13,12 +10,7 @@ from jaxil.learner.state import LearnerParams, copy_params
 from jaxil.maths import stacking
 from jaxil.maths.types import Episode, ExpertEpisodes, Params
 from jaxil.networks.agent import actor_features
-from jaxil.rewarders.matching import scale_of_first_episode
-
-# (agent features [T + 1, D], expert features [K, N + 1, D], frames of each that are its
-# own [K]) -> rewards [T + 1] of o_0 ... o_T, or a plan [T + 1, N + 1] and the index of
-# its demonstration.
-Compare = Callable[[Array, Array, Array], Any]
+from jaxil.rewarders.comparison import Compare, make_comparing_rewarder
 
 
 class TargetState(struct.PyTreeNode):
@@ -55,11 +47,10 @@ def make_target_rewarder(
 
     Args:
       agent: only its encoder and the actor's trunk are used.
-      compare: features to rewards, before scaling.
-      plan: the transport plan behind them; None without one.
+      compare: see `make_comparing_rewarder`, as `plan` and `return_scale`.
+      plan: the transport plan behind the rewards; None without one.
       target_update_steps: agent steps between copies.
-      return_scale: the first episode's rewards are scaled to return minus this, and
-        that scale stays; None: rewards are not scaled.
+      return_scale: minus the first episode's return; None: rewards are not scaled.
     """
 
     def embed(encoder: Params, actor: Params, frames: Array) -> Array:
@@ -94,74 +85,29 @@ def make_target_rewarder(
             steps_since_copy=jnp.zeros((), jnp.int32),
         )
 
-    def unscaled(
-        compared: Compare,
-        state: TargetState,
-        episode: Episode,
-        expert_episodes: ExpertEpisodes | None,
-    ) -> Any:
-        assert expert_episodes is not None
-        features = embed(state.target_encoder, state.target_actor, episode.frames)
-        return compared(features, state.expert_features, expert_episodes.num_frames)
-
-    def scaled(
-        state: TargetState, episode: Episode, expert_episodes: ExpertEpisodes
-    ) -> TargetState:
-        def first_scale() -> Array:
-            assert return_scale is not None
-            rewards = unscaled(compare, state, episode, expert_episodes)[1:]
-            return scale_of_first_episode(rewards, return_scale)
-
-        scale = jax.lax.cond(state.scale > 0.0, lambda: state.scale, first_scale)
-        return state.replace(scale=scale)
-
-    def observe(
+    def look(
         state: TargetState,
         learner: LearnerParams,
         episode: Episode,
-        expert_episodes: ExpertEpisodes | None,
+        expert_episodes: ExpertEpisodes,
     ) -> TargetState:
-        assert expert_episodes is not None
         num_steps = jnp.asarray(episode.actions.shape[0], jnp.int32)
         state = state.replace(steps_since_copy=state.steps_since_copy + num_steps)
-        state = jax.lax.cond(
+        return jax.lax.cond(
             state.steps_since_copy >= target_update_steps,
             lambda old: copy_targets(old, learner, expert_episodes),
             lambda old: old,
             state,
         )
-        return (
-            state if return_scale is None else scaled(state, episode, expert_episodes)
-        )
 
-    def rewards(
-        state: TargetState,
-        learner: LearnerParams,
-        episode: Episode,
-        expert_episodes: ExpertEpisodes | None,
-    ) -> Array:
-        del learner
-        # Reward t is that of o_{t+1}.
-        return state.scale * unscaled(compare, state, episode, expert_episodes)[1:]
-
-    def plan_of(
-        state: TargetState,
-        learner: LearnerParams,
-        episode: Episode,
-        expert_episodes: ExpertEpisodes,
-    ) -> tuple[Array, Array]:
-        del learner
-        assert plan is not None
-        return unscaled(plan, state, episode, expert_episodes)
-
-    return Rewarder(
-        rewards,
-        init,
-        observe=observe,
-        matches_episodes=True,
-        rewards_changed=lambda state: state.steps_since_copy == 0,
-        plan=None if plan is None else plan_of,
-        summary=lambda state: (
-            {} if return_scale is None else {"sinkhorn/scale": state.scale}
+    return make_comparing_rewarder(
+        init=init,
+        look=look,
+        embed=lambda state, frames: embed(
+            state.target_encoder, state.target_actor, frames
         ),
+        compare=compare,
+        plan=plan,
+        return_scale=return_scale,
+        rewards_changed=lambda state: state.steps_since_copy == 0,
     )

@@ -51,6 +51,7 @@ PSIL = psil.make_rewarder(
     epsilon=0.01,
     num_iterations=20,
     target_update_steps=10,
+    num_components=0,
     return_scale=10.0,
 )
 

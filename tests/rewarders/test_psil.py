@@ -39,6 +39,7 @@ def make_rewarder(frame_stack=1, alignment="transport"):
         epsilon=0.01,
         num_iterations=50,
         target_update_steps=20,
+        num_components=0,
         return_scale=10.0,
     )
 

@@ -41,7 +41,12 @@ def make_rewarder(context_length, band_steps):
 
 
 PSIL = psil.make_rewarder(
-    make_agent(), cost="cosine", alignment="transport", return_scale=10.0, **SETTINGS
+    make_agent(),
+    cost="cosine",
+    alignment="transport",
+    return_scale=10.0,
+    num_components=0,
+    **SETTINGS,
 )
 compiled = functools.cache(make_play)
 
