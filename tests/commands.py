@@ -46,6 +46,7 @@ _OWN = {
     "sil": ("discriminator.batch_size=8", "sinkhorn.num_iterations=10"),
     "bc": ("cloning.batch_size=8",),
     "bco": ("cloning.batch_size=8", "inverse_model.hidden_dim=16"),
+    "bcvlr": ("cloning.batch_size=8", "latent.hidden_dim=16"),
 }
 
 

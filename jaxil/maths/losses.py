@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 _NORM_FLOOR = 1e-12  # added under the root: d|g|/dg is undefined at g = 0
+_STD_FLOOR = 1e-6  # leaves features that are all alike at zero instead of NaN
 
 
 def td_target(reward: Array, discount: Array, next_values: Array) -> Array:
@@ -130,3 +131,28 @@ def cloning_loss(mean: Array, action: Array, *, std: float) -> Array:
     chex.assert_rank([mean, action], 2)
     chex.assert_equal_shape([mean, action])
     return -jnp.mean(jnp.sum(jax.scipy.stats.norm.logpdf(action, mean, std), axis=1))
+
+
+def prediction_loss(prediction: Array, features: Array) -> Array:
+    """Returns the mean squared error of predicted features, in standard deviations.
+
+        L = mean_bd (p_bd - (z_bd - m_d) / s_d)^2
+
+    with mean m and standard deviation s of each feature over the batch. Whoever guesses
+    the same for every row has at best L = 1, however small s is (above 1e-6), so that
+    nothing is gained by shrinking features to a constant. It is no guard against
+    features that all tell the same.
+
+    Args:
+      prediction: p. Shape [B, D].
+      features: z, without gradient. Shape [B, D].
+
+    Source: liuxin0824/BCV-LR, models.py, `WorldModel.label`, is the squared error; its
+    features need no standard deviations, since the error does not train them.
+    """
+    chex.assert_rank([prediction, features], 2)
+    chex.assert_equal_shape([prediction, features])
+    features = jax.lax.stop_gradient(features)
+    centred = features - jnp.mean(features, axis=0, keepdims=True)
+    std = jnp.std(features, axis=0, keepdims=True)
+    return jnp.mean(jnp.square(prediction - centred / (std + _STD_FLOOR)))

@@ -112,6 +112,8 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     if "inverse_model" in config:
         config.inverse_model.hidden_dim = 256
         config.inverse_model.learning_rate = 3e-4
+    if "latent" in config:
+        config.latent.hidden_dim = 256
     if config.action_repeat > 2:  # fewer agent steps in as many frames
         config.exploration_steps = 500
         config.exploration_std_steps = 20_000

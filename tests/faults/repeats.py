@@ -17,7 +17,9 @@ import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-METHODS = "pdac,psil,temporal_ot,orca,patchail,laifo,gaifo,dac,sil,bc,bco,drqv2,zero"
+METHODS = (
+    "pdac,psil,temporal_ot,orca,patchail,laifo,gaifo,dac,sil,bc,bco,bcvlr,drqv2,zero"
+)
 # Large enough for XLA to divide the work of an update among cores.
 SIDE, BATCH, HIDDEN = 20, 16, 256
 

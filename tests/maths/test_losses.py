@@ -154,3 +154,36 @@ class GradientPenaltyTest(chex.TestCase):
             lambda x: 0.5 * jnp.sum(x**2, axis=1), points, points, jax.random.key(0)
         )
         np.testing.assert_allclose(penalty, (1.0 + 16.0) / 2.0, rtol=1e-5)
+
+
+class PredictionLossTest(chex.TestCase):
+    def test_by_hand(self):
+        # Features 1 and 5 are one standard deviation from their mean, 3.
+        features = jnp.array([[1.0, 10.0], [5.0, 20.0]])
+        loss = jax.jit(losses.prediction_loss)
+        right = jnp.array([[-1.0, -1.0], [1.0, 1.0]])
+        np.testing.assert_allclose(loss(right, features), 0.0, atol=1e-10)
+        # (4 + 0 + 0 + 1) / 4
+        other = jnp.array([[1.0, -1.0], [1.0, 0.0]])
+        np.testing.assert_allclose(loss(other, features), 1.25, rtol=1e-5)
+
+    @parameterized.parameters(1.0, 1e-3)
+    def test_small_features_are_no_easier_to_guess(self, scale):
+        """A constant costs 1, however close the features have come to one."""
+        features = 0.5 + scale * jax.random.normal(jax.random.key(0), (64, 5))
+        loss = losses.prediction_loss(jnp.zeros((64, 5)), features)
+        np.testing.assert_allclose(loss, 1.0, rtol=1e-2)
+        guess = jnp.tile(jnp.linspace(-0.2, 0.3, 5)[None], (64, 1))
+        assert losses.prediction_loss(guess, features) > loss
+
+    def test_the_target_has_no_gradient_and_may_be_constant(self):
+        value, gradients = jax.value_and_grad(losses.prediction_loss, argnums=(0, 1))(
+            jnp.ones((4, 2)), jnp.full((4, 2), 0.3)
+        )
+        np.testing.assert_allclose(value, 1.0)
+        np.testing.assert_allclose(gradients[0], np.full((4, 2), 2 / 8))
+        np.testing.assert_array_equal(gradients[1], np.zeros((4, 2)))
+
+    def test_rejects_unequal_shapes(self):
+        with pytest.raises(AssertionError):
+            losses.prediction_loss(jnp.ones((4, 2)), jnp.ones((4, 1)))
