@@ -110,10 +110,43 @@ DISCRIMINATOR = {
         128, "expert samples, and agent samples, in an update; 128 in ROT", 1, 65_536
     ),
 }
+COMPONENTS = Field(
+    0,
+    "principal components of each frame that are judged; 0, the paper's: features",
+    0,
+    1024,
+)
+PDAC_DISCRIMINATOR = {
+    **DISCRIMINATOR,
+    "sees_actions": Field(False, "appends actions to the features"),
+    "num_components": COMPONENTS,
+}
 CLONING = {
     "batch_size": Field(128, "expert samples; 128 in ROT", 1, 65_536),
     "std": Field(0.1, "of the policy whose likelihood is raised; 0.1", 1e-6, 10.0),
 }
+# Beside the sections of another method, so no name is one of theirs: all are keyword
+# arguments of one function.
+PSEUDO_ACTIONS = {
+    "num_pairs": Field(128, "expert transitions that are cloned", 1, 65_536),
+    "weight": Field(
+        0.4, "of cloning, in units of mean |Q|; 0.4, 1 / 2.5 in TD3+BC", 0, 1e6
+    ),
+    "trust": Field(
+        "agreement",
+        "in a label: by its models' agreement; where the critic prefers it; always",
+        choices=("agreement", "q_filter", "none"),
+    ),
+    "trust_scale": Field(
+        0.01, "variance of labels at which agreement is 1/e", 0, 1e6, positive=True
+    ),
+}
+INVERSE_MODELS = {
+    "num_models": Field(3, "heads on one encoder; 1 always agrees", 1, 100),
+    "head_dim": Field(1024, "width of their hidden layers", 1, 10**5),
+    "model_learning_rate": Field(1e-4, "of their Adam", 0, 1, positive=True),
+}
+INVERSE_MODELS_METRICS = ("inverse_model/error", "inverse_model/agreement")
 DISCRIMINATOR_METRICS = (
     "discriminator/loss",
     "discriminator/penalty",
@@ -123,12 +156,6 @@ DISCRIMINATOR_METRICS = (
 RELABELS = Field(
     True,
     "rewards are recomputed for every batch; False: stored, see reward_refresh_steps",
-)
-COMPONENTS = Field(
-    0,
-    "principal components of each frame that are judged; 0, the paper's: features",
-    0,
-    1024,
 )
 SINKHORN = {
     "cost": Field("cosine", "between features", choices=("cosine", "euclidean")),
@@ -150,6 +177,7 @@ TARGETS = {
         10_000, "agent steps between two target copies; 10000 in the paper", 1, 10**9
     ),
 }
+PSIL_SINKHORN = {**SINKHORN, **TARGETS, "num_components": COMPONENTS}
 
 
 def known() -> dict[str, Method]:

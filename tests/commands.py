@@ -47,6 +47,14 @@ _OWN = {
     "bc": ("cloning.batch_size=8",),
     "bco": ("cloning.batch_size=8", "inverse_model.hidden_dim=16"),
     "bcvlr": ("cloning.batch_size=8", "latent.hidden_dim=16"),
+    "pdac_cloning": (
+        *("discriminator.hidden_dim=16", "discriminator.batch_size=8"),
+        *("cloning.num_pairs=8", "inverse_model.head_dim=16"),
+    ),
+    "psil_cloning": (
+        *("sinkhorn.target_update_steps=150", "sinkhorn.num_iterations=10"),
+        *("cloning.num_pairs=8", "inverse_model.head_dim=16"),
+    ),
 }
 
 

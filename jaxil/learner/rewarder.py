@@ -47,8 +47,10 @@ class AgentView(NamedTuple):
       action: shape [B, A].
       unshifted: the pixels as they were stored. Shape [B, H, W, C].
       successor: the observations one step later, augmented, like `observation`, and
-      successor_features: their features, like `features`; both None unless the method
-        has `samples_successors`.
+      successor_features: their features, like `features`.
+      unshifted_successor: the same observations as they were stored, for methods that
+        shift an observation and its successor alike. These three are None unless the
+        method has `samples_successors`.
     """
 
     observation: Array
@@ -57,6 +59,7 @@ class AgentView(NamedTuple):
     unshifted: Array
     successor: Array | None = None
     successor_features: Array | None = None
+    unshifted_successor: Array | None = None
 
 
 class Spec(NamedTuple):

@@ -156,7 +156,7 @@ def make_update_step(learner: Learner) -> UpdateStep:
 def _with_successors(
     learner: Learner, before: LearnerParams, batch: Batch, agent: AgentView, key: Array
 ) -> AgentView:
-    """Adds augmented successors, and their features without gradient."""
+    """Adds successors: augmented, their features without gradient, and as stored."""
     assert batch.successor is not None
     # A separate key, so that no other random number depends on successors.
     successor = _augment(learner, batch.successor, jax.random.fold_in(key, 1))
@@ -164,7 +164,9 @@ def _with_successors(
         learner.networks, before.encoder, before.critic, successor
     )
     return agent._replace(
-        successor=successor, successor_features=jax.lax.stop_gradient(features)
+        successor=successor,
+        successor_features=jax.lax.stop_gradient(features),
+        unshifted_successor=batch.successor,
     )
 
 

@@ -29,3 +29,32 @@ class InverseModel(nn.Module):
         features = [embed(observation), embed(successor)]
         mlp = MLP(self.hidden_dim, self.action_dim)
         return jnp.tanh(mlp(jnp.concatenate(features, axis=-1)))
+
+
+class InverseModels(nn.Module):
+    """Several inverse models with one encoder and one embedding, but separate heads.
+
+    The heads start apart and learn from the same samples, so they come to agree where
+    there are many and less where there are few.
+    """
+
+    encoder: Any
+    feature_dim: int
+    hidden_dim: int
+    action_dim: int
+    num_models: int
+
+    @nn.compact
+    def __call__(self, observation: Array, successor: Array) -> Array:
+        """Maps twice [B, H, W, C] to each model's actions [M, B, A], in [-1, 1]."""
+        embed = Embedding(self.encoder, self.feature_dim)
+        features = [embed(observation), embed(successor)]
+        shared: Any = None  # flax takes it, but declares numbers only
+        heads = nn.vmap(
+            MLP,
+            in_axes=shared,
+            axis_size=self.num_models,
+            variable_axes={"params": 0},
+            split_rngs={"params": True},
+        )(self.hidden_dim, self.action_dim)
+        return jnp.tanh(heads(jnp.concatenate(features, axis=-1)))

@@ -19,10 +19,12 @@ shadows. Other deviations from the paper:
 - The replay is smaller, so that its rewards are newer, and they are recomputed
   (`reward_refresh_steps = 2_500`): those of the first episodes come from an untrained
   discriminator and would teach the critic that random behaviour is best.
-- On the walkers P-DAC's discriminator judges 32 principal components of each frame
-  instead of the critic's features, which mislead it: `walker_stand` is learned with the
-  first and not with the second. On `ball_in_cup_catch` it is the other way round: a
-  small ball is lost in components (launch/results/README.md, "Learning: the ladder").
+- On the walkers and on finger_spin P-DAC's discriminator judges 32 principal components
+  of each frame instead of the critic's features, which mislead it: `walker_stand` and
+  `finger_spin` are learned with the first and not with the second. On
+  `ball_in_cup_catch` it is the other way round: a small ball is lost in components
+  (launch/results/README.md, "Learning: the ladder"). P-SIL compares them on
+  finger_spin; on `walker_stand` they mislead it too.
 - cartpole_swingup is seen by the camera that follows the cart. DrQ-v2's shows the pole
   one pixel wide, and not at the rail's ends: agents needed more frames, and then
   dropped the pole again and again. Pixels of another renderer may need
@@ -45,7 +47,18 @@ _FALLING_RATES = {
     "cartpole_swingup": (300_000, 75_000),
     "walker_walk": (600_000, 250_000),
 }
-_NUM_COMPONENTS = {"walker_stand": 32, "walker_walk": 32, "walker_run": 32}
+_WALKERS = ("walker_stand", "walker_walk", "walker_run")
+_JUDGED_BY_COMPONENTS = {"pdac": (*_WALKERS, "finger_spin"), "psil": ("finger_spin",)}
+_SMALL = {
+    "cloning": {"batch_size": 64, "num_pairs": 64},
+    "inverse_model": {
+        "hidden_dim": 256,
+        "learning_rate": 3e-4,
+        "head_dim": 256,
+        "model_learning_rate": 3e-4,
+    },
+    "latent": {"hidden_dim": 256},
+}
 # These have a separate encoder, and penalties need its second derivatives: with 64, an
 # update of DAC takes five times as long.
 _DISCRIMINATOR_BATCHES = {"dac": 16, "sil": 16, "gaifo": 16, "patchail": 8}
@@ -82,24 +95,25 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     if task in _FALLING_RATES:
         config.total_frames, config.learning_rate_steps = _FALLING_RATES[task]
         config.learning_rate_end = 5e-5
-    is_walker = task in _NUM_COMPONENTS
-    config.pre_tanh_penalty = 2e-5 if method == "psil" and is_walker else 2e-3
+    rewarder = method.removesuffix("_cloning")
+    lighter = rewarder == "psil" and task in _WALKERS
+    config.pre_tanh_penalty = 2e-5 if lighter else 2e-3
     config.policy_tau = 1e-3
     config.replay_size_steps = 50_000
     config.replay_on_device = True  # also on CPUs, where XLA stacks faster than NumPy
-    config.exploration_std_steps = 50_000
+    config.exploration_std_steps = 20_000 if task == "finger_spin" else 50_000
     own = config.get("discriminator", {})
     if "hidden_dim" in own:
         own.hidden_dim = 256
-        own.gradient_penalty = _GRADIENT_PENALTIES.get((method, task), 10.0)
-    if "num_components" in own:
-        own.num_components = _NUM_COMPONENTS.get(task, 0)
+        own.gradient_penalty = _GRADIENT_PENALTIES.get((rewarder, task), 10.0)
     if "width" in own:
         own.width = 8
     if own:
         own.batch_size = _DISCRIMINATOR_BATCHES.get(method, 64)
         own.learning_rate = 3e-4
     transport = config.get("sinkhorn", {})
+    if task in _JUDGED_BY_COMPONENTS.get(rewarder, ()):
+        (transport or own).num_components = 32
     if transport:
         transport.num_iterations = 50
     if "target_update_steps" in transport:
@@ -107,13 +121,10 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     config.reward_refresh_steps = 2_500
     config.eval_every_frames = 10_000
     config.checkpoint_every_frames = 10_000
-    if "cloning" in config:
-        config.cloning.batch_size = 64
-    if "inverse_model" in config:
-        config.inverse_model.hidden_dim = 256
-        config.inverse_model.learning_rate = 3e-4
-    if "latent" in config:
-        config.latent.hidden_dim = 256
+    for section, sizes in _SMALL.items():
+        if section in config:
+            has = config[section]
+            has.update({name: sizes[name] for name in sizes if name in has})
     if config.action_repeat > 2:  # fewer agent steps in as many frames
         config.exploration_steps = 500
         config.exploration_std_steps = 20_000

@@ -26,13 +26,7 @@ METHOD = methods.Method(
     about="adversarial rewards on single observations",
     colour="#0072B2",
     rank=1,
-    sections={
-        "discriminator": {
-            **methods.DISCRIMINATOR,
-            "sees_actions": methods.Field(False, "appends actions to the features"),
-            "num_components": methods.COMPONENTS,
-        }
-    },
+    sections={"discriminator": methods.PDAC_DISCRIMINATOR},
     sees_actions="discriminator.sees_actions",
     metrics=methods.DISCRIMINATOR_METRICS,
     variations=(methods.Variation("discriminator.sees_actions", False, "actions"),),

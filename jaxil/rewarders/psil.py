@@ -13,13 +13,7 @@ METHOD = methods.Method(
     about="optimal transport to the closest demonstration",
     colour="#D55E00",
     rank=2,
-    sections={
-        "sinkhorn": {
-            **methods.SINKHORN,
-            **methods.TARGETS,
-            "num_components": methods.COMPONENTS,
-        }
-    },
+    sections={"sinkhorn": methods.PSIL_SINKHORN},
     metrics=("sinkhorn/scale",),
     variations=(
         methods.Variation("sinkhorn.cost", "cosine", "{}"),

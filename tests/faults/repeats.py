@@ -18,7 +18,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 METHODS = (
-    "pdac,psil,temporal_ot,orca,patchail,laifo,gaifo,dac,sil,bc,bco,bcvlr,drqv2,zero"
+    "pdac,psil,temporal_ot,orca,patchail,laifo,gaifo,dac,sil,bc,bco,bcvlr,"
+    "pdac_cloning,psil_cloning,drqv2,zero"
 )
 # Large enough for XLA to divide the work of an update among cores.
 SIDE, BATCH, HIDDEN = 20, 16, 256

@@ -95,6 +95,7 @@ def test_the_rewarder_sees_augmented_features_from_before_the_update():
     np.testing.assert_allclose(agent.features, features_of(state, shifted), atol=1e-5)
     assert agent.successor is None
     assert agent.successor_features is None
+    assert agent.unshifted_successor is None
 
 
 def features_of(state, observation):
@@ -118,11 +119,14 @@ def test_successors_come_augmented_with_their_features_and_change_nothing_else()
     assert len({tuple(np.argwhere(m)[0]) for m in matches}) > 1
     features = features_of(state, agent.successor)
     np.testing.assert_allclose(agent.successor_features, features, atol=1e-5)
+    np.testing.assert_array_equal(agent.unshifted_successor, batch.successor)
     np.testing.assert_array_equal(after.rewarder["expert"].successor, expert.successor)
     # The learner, and what the rewarder saw before, are the same to the last bit.
     assert_identical(after.replace(rewarder=()), without.replace(rewarder=()))
     assert_identical(
-        agent._replace(successor=None, successor_features=None),
+        agent._replace(
+            successor=None, successor_features=None, unshifted_successor=None
+        ),
         without.rewarder["agent"],
     )
 

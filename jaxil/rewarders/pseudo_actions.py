@@ -1,0 +1,247 @@
+"""Cloning of inferred actions, beside the rewards of any other method.
+
+Inverse models learn from the agent's own play which action leads from one observation
+to the next, as in BCO, and infer the actions of the expert's video. The actor then
+follows rewards and, as far as those pseudo-actions are trusted, copies them.
+"""
+
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax import Array
+
+from jaxil.learner.rewarder import (
+    AgentSpec,
+    AgentView,
+    Rewarder,
+    RewarderState,
+    Spec,
+)
+from jaxil.learner.state import (
+    LearnerParams,
+    ModuleState,
+    apply_gradients,
+    init_module,
+)
+from jaxil.maths import augmentation, cloning
+from jaxil.maths.types import (
+    Episode,
+    ExpertBatch,
+    ExpertEpisodes,
+    Metrics,
+    Params,
+)
+from jaxil.networks.agent import apply
+from jaxil.networks.inverse_model import InverseModels
+
+# Folded into keys that the inner method gets too. `split(key)[n]` may be
+# `fold_in(key, n)`, so a small number could be one of the inner method's own.
+_OWN_KEY = 2**31
+
+
+class CloningState(struct.PyTreeNode):
+    """The state of the method that rewards, and the inverse models.
+
+    Attributes:
+      inner: the other method's.
+      models: of `InverseModels`.
+    """
+
+    inner: RewarderState
+    models: ModuleState
+
+
+def with_cloning(
+    rewarder: Rewarder,
+    agent: AgentSpec,
+    *,
+    num_pairs: int,
+    weight: float,
+    trust: str,
+    trust_scale: float,
+    num_models: int,
+    head_dim: int,
+    model_learning_rate: float,
+) -> Rewarder:
+    """Returns a rewarder with the same rewards, whose actor also clones pseudo-actions.
+
+        min_g   mean_m mean_t |g_m(o_t, o_{t+1}) - a_t|^2      over the agent's samples
+        L_actor = ... + weight s mean_t w_t |pi(e_t) - mean_m g_m(e_t, e_{t+1})|^2
+
+    with the trust w in a label and s = mean |Q| of the agent's samples, without
+    gradient, so that the term's share does not depend on the scale of rewards. The
+    inverse models have an encoder of their own. The expert's actions are not read here;
+    whether the inner method reads them is its own affair.
+
+    Expert samples are those that the inner method asks for, or `num_pairs` if that is
+    more, and each of both uses the first rows. The inner method is given the random
+    keys, samples and states that it would have alone; with weight 0 the agent learns
+    as it would with the inner method, but for rounding.
+
+    Args:
+      rewarder: the inner method.
+      agent: its networks say what encoder and embedding the inverse models have.
+      num_pairs: expert transitions whose pseudo-actions are cloned in an update.
+      weight: of the term.
+      trust: "agreement": `cloning.agreement_trust`; "q_filter": `cloning.q_filter`,
+        by the critic as the actor's loss sees it; "none": 1.
+      trust_scale: of "agreement"; models that have learned nothing are about 0.05
+        apart, on two actions as on six, and so are hardly trusted with 0.01.
+      num_models: M, inverse models; they share encoder and embedding.
+      head_dim: width of their separate heads.
+      model_learning_rate: of their Adam.
+
+    Source: Torabi et al. 2018, arXiv:1805.01954, for pseudo-actions; ROT
+    (siddhanthaldar/ROT) for cloning beside rewards by imitation, of actions that are
+    known there. The combination is this project's own.
+    """
+    encoder, actor, critic = agent.networks
+    models = InverseModels(
+        encoder, actor.feature_dim, head_dim, actor.action_dim, num_models
+    )
+    optimiser = optax.adam(model_learning_rate)
+    expert_batch_size = max(rewarder.expert_batch_size, num_pairs)
+
+    def inner_samples(
+        view: AgentView, expert: ExpertBatch
+    ) -> tuple[AgentView, ExpertBatch | None]:
+        """Returns what the inner method asks for."""
+        if not rewarder.samples_successors:
+            view = view._replace(
+                successor=None, successor_features=None, unshifted_successor=None
+            )
+            expert = expert._replace(successor=None)
+        if not rewarder.expert_batch_size:
+            return view, None
+        return view, _first_rows(expert, rewarder.expert_batch_size)
+
+    def infer(params: Params, expert: ExpertBatch) -> Array:
+        """Returns each model's pseudo-actions, [M, B, A]."""
+        pairs = _first_rows(expert, num_pairs)
+        return apply(models, params, pairs.observation, pairs.successor)
+
+    def init(key: Array, spec: Spec, learner: LearnerParams) -> CloningState:
+        observation = jnp.zeros((1, *spec.observation_shape))
+        params = models.init(
+            jax.random.fold_in(key, _OWN_KEY), observation, observation
+        )
+        return CloningState(
+            rewarder.init(key, spec, learner), init_module(params, optimiser)
+        )
+
+    def update(
+        state: CloningState,
+        learner: LearnerParams,
+        view: AgentView,
+        expert: ExpertBatch | None,
+        key: Array,
+    ) -> tuple[CloningState, Metrics]:
+        assert expert is not None
+        assert view.unshifted_successor is not None
+        chex.assert_axis_dimension(expert.observation, 0, expert_batch_size)
+        chex.assert_equal_shape([view.unshifted, view.unshifted_successor])
+        inner, metrics = rewarder.update(
+            state.inner, learner, *inner_samples(view, expert), key
+        )
+        # One shift for both observations, or what moves would be lost in it.
+        moments = augmentation.augment(
+            jnp.concatenate([view.unshifted, view.unshifted_successor], axis=-1),
+            jax.random.fold_in(key, _OWN_KEY),
+            padding=agent.shift_padding,
+        )
+        pair = jnp.split(moments, 2, axis=-1)
+
+        def loss(params: Params) -> Array:
+            inferred = apply(models, params, *pair)
+            chex.assert_equal_shape([inferred[0], view.action])
+            return jnp.mean(jnp.sum(jnp.square(inferred - view.action[None]), axis=2))
+
+        error, gradients = jax.value_and_grad(loss)(state.models.params)
+        agreement = cloning.agreement_trust(
+            cloning.disagreement(infer(state.models.params, expert)), scale=trust_scale
+        )
+        state = CloningState(inner, apply_gradients(state.models, gradients, optimiser))
+        return state, {
+            **metrics,
+            "inverse_model/error": error,
+            "inverse_model/agreement": jnp.mean(agreement),
+        }
+
+    def actor_loss(
+        state: CloningState,
+        learner: LearnerParams,
+        view: AgentView,
+        expert: ExpertBatch | None,
+        key: Array,
+    ) -> Array:
+        assert expert is not None
+        inferred = infer(state.models.params, expert)
+        label = jnp.mean(inferred, axis=0)
+        observation = augmentation.augment(
+            jnp.asarray(expert.observation)[:num_pairs],
+            jax.random.fold_in(key, _OWN_KEY),
+            padding=agent.shift_padding,
+        )
+        representation = apply(encoder, learner.encoder, observation)
+        action = jnp.tanh(apply(actor, learner.actor, representation))
+
+        def values(features: Array, taken: Array) -> Array:
+            return apply(critic, learner.critic, features, taken, method=critic.values)
+
+        if trust == "agreement":
+            distance = cloning.disagreement(inferred)
+            trusted = cloning.agreement_trust(distance, scale=trust_scale)
+        elif trust == "q_filter":
+            features = apply(
+                critic, learner.critic, representation, method=critic.features
+            )
+            trusted = cloning.q_filter(
+                values(features, label), values(features, action)
+            )
+        else:
+            trusted = jnp.ones(num_pairs)
+        # The features are one update older than the rest: for a scale that is enough.
+        scale = cloning.value_scale(values(view.features, view.action))
+        term = weight * scale * cloning.trusted_cloning_loss(action, label, trusted)
+        if rewarder.actor_loss is None:
+            return term
+        samples = inner_samples(view, expert)
+        return term + rewarder.actor_loss(state.inner, learner, *samples, key)
+
+    def observe(
+        state: CloningState,
+        learner: LearnerParams,
+        episode: Episode,
+        expert_episodes: ExpertEpisodes | None,
+    ) -> CloningState:
+        inner = rewarder.observe(state.inner, learner, episode, expert_episodes)
+        return state.replace(inner=inner)
+
+    def of_inner(function: Any) -> Any:
+        """Returns an inner function of the whole state; None where there is none."""
+        if function is None:
+            return None
+        return lambda state, *arguments: function(state.inner, *arguments)
+
+    return Rewarder(
+        of_inner(rewarder.rewards),
+        init,
+        update,
+        observe,
+        expert_batch_size=expert_batch_size,
+        matches_episodes=rewarder.matches_episodes,
+        samples_successors=True,
+        relabel=of_inner(rewarder.relabel),
+        rewards_changed=of_inner(rewarder.rewards_changed),
+        actor_loss=actor_loss,
+        plan=of_inner(rewarder.plan),
+        summary=of_inner(rewarder.summary),
+    )
+
+
+def _first_rows(expert: ExpertBatch, count: int) -> ExpertBatch:
+    return jax.tree.map(lambda values: jnp.asarray(values)[:count], expert)
