@@ -5,7 +5,7 @@ import difflib
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-_SHORT_LIST = 16  # longer lists are cut
+_SHORT_LIST = 20
 _MAX_VALUE, _MAX_FAULT = 200, 4000  # letters that are shown
 _ABSENT = object()
 

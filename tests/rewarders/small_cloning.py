@@ -33,6 +33,7 @@ OF_PSIL: dict[str, Any] = {
     "num_iterations": 20,
     "target_update_steps": 10,
     "return_scale": 10.0,
+    "num_components": 0,
 }
 OF_CLONING: dict[str, Any] = {
     "num_pairs": 6,
