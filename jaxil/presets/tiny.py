@@ -9,8 +9,8 @@ shadows. Other deviations from the paper:
   small moving body is only a few pixels at 48x48.
 - The squared pre-tanh mean is penalised, since small actors saturate permanently.
   Beside P-SIL's small rewards that weight is a hundred times as heavy, and with it
-  `walker_stand` learned to lie still on state vectors, so it is smaller there. From
-  pixels P-SIL has not learned to stand with either.
+  `walker_stand` learned to lie still on state vectors and `finger_spin` nothing, so it
+  is smaller there. From pixels P-SIL has not learned to stand with either.
 - The average of the policies of about the last 1000 updates is evaluated and kept
   (`policy_tau`), since the newest falls back between evaluations. Training never
   uses the average.
@@ -32,8 +32,9 @@ shadows. Other deviations from the paper:
 - cartpole_swingup repeats actions 4 times: with 2, a pole at 1 rad/s moves a quarter of
   a pixel between frames, which hides its speed, and agents only learned to spin it;
   with 8, none learned to balance it. P-DAC's gradient penalty has weight 1 there.
-- Learning rates fall on cartpole_swingup and walker_walk: agents that walk fall over
-  again and again at the first rate (457 of 961 at 500k frames), and less at the last.
+- Learning rates fall on cartpole_swingup, finger_spin and walker_walk: agents that walk
+  fall over again and again at the first rate (457 of 961 at 500k frames), and less at
+  the last.
 """
 
 from jaxil import config as jaxil_config
@@ -45,6 +46,7 @@ _GRADIENT_PENALTIES = {("pdac", "cartpole_swingup"): 1.0}
 # Frames of a run, and agent steps over which learning rates fall.
 _FALLING_RATES = {
     "cartpole_swingup": (300_000, 75_000),
+    "finger_spin": (300_000, 125_000),
     "walker_walk": (600_000, 250_000),
 }
 _WALKERS = ("walker_stand", "walker_walk", "walker_run")
@@ -96,7 +98,7 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
         config.total_frames, config.learning_rate_steps = _FALLING_RATES[task]
         config.learning_rate_end = 5e-5
     rewarder = method.removesuffix("_cloning")
-    lighter = rewarder == "psil" and task in _WALKERS
+    lighter = rewarder == "psil" and task in (*_WALKERS, "finger_spin")
     config.pre_tanh_penalty = 2e-5 if lighter else 2e-3
     config.policy_tau = 1e-3
     config.replay_size_steps = 50_000
