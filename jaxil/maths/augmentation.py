@@ -14,6 +14,23 @@ def augment(observation: Array, key: Array, *, padding: int) -> Array:
     return random_shift(observation, key, padding=padding)
 
 
+def augment_pair(
+    first: Array, second: Array, key: Array, *, padding: int
+) -> tuple[Array, Array]:
+    """Augments two observations in turn by one shift, so that what moved is kept.
+
+    Args:
+      first: o_t. Shape [B, H, W, C], or [B, S].
+      second: o_{t+1}, like `first`.
+      key: consumed.
+      padding: see `random_shift`.
+    """
+    chex.assert_equal_shape([first, second])
+    both = augment(jnp.concatenate([first, second], axis=-1), key, padding=padding)
+    first, second = jnp.split(both, 2, axis=-1)
+    return first, second
+
+
 def random_shift(images: Array, key: Array, *, padding: int) -> Array:
     """Shifts each image by whole pixels, repeating the border.
 

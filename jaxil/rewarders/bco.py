@@ -118,11 +118,10 @@ def make_update_step(
         chex.assert_axis_dimension(expert.observation, 0, batch_size)
         step_key = jax.random.fold_in(state.key, state.num_updates)
         pair_key, expert_key = jax.random.split(step_key)
-        # One shift for both observations, or what moves would be lost in it.
-        moments = jnp.concatenate([batch.observation, batch.successor], axis=-1)
         padding = learner.shift_padding
-        moments = augmentation.augment(moments, pair_key, padding=padding)
-        pair = jnp.split(moments, 2, axis=-1)
+        pair = augmentation.augment_pair(
+            batch.observation, batch.successor, pair_key, padding=padding
+        )
 
         def loss(params: Params) -> Array:
             inferred = apply(model, params, *pair)

@@ -5,8 +5,6 @@ agent's own play tells which action each stands for, and the policy clones those
 Neither a reward nor a critic is involved.
 """
 
-from typing import Any
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -210,13 +208,15 @@ def make_update_step(
     )
     optimiser = optax.adam(learning_rate)
 
-    def infer(params: tuple[Params, Params], pair: list[Array]) -> tuple[Array, Array]:
+    def infer(
+        params: tuple[Params, Params], pair: tuple[Array, Array]
+    ) -> tuple[Array, Array]:
         """Returns the features of the first observation, and the latent action."""
         features = [apply(embedding, params[0], observation) for observation in pair]
         return features[0], apply(model, params[1], *features, method=model.infer)
 
     def on_video(
-        params: tuple[Params, Params], pair: list[Array], target: Array
+        params: tuple[Params, Params], pair: tuple[Array, Array], target: Array
     ) -> tuple[Array, Array, Metrics]:
         """Returns the loss, the decoded actions and metrics."""
         features, latent = infer(params, pair)
@@ -236,7 +236,7 @@ def make_update_step(
         return error + distance + commitment * committed, action, metrics
 
     def on_play(
-        params: tuple[Params, Params], pair: list[Array], action: Array
+        params: tuple[Params, Params], pair: tuple[Array, Array], action: Array
     ) -> Array:
         """Returns the decoder's squared error on the agent's transitions."""
         _, latent = infer(params, pair)
@@ -257,8 +257,12 @@ def make_update_step(
         step_key = jax.random.fold_in(state.key, state.num_updates)
         play_key, video_key, expert_key = jax.random.split(step_key, 3)
         padding = learner.shift_padding
-        play = _shift(batch.observation, batch.successor, play_key, padding)
-        video = _shift(expert.observation, expert.successor, video_key, padding)
+        play = augmentation.augment_pair(
+            batch.observation, batch.successor, play_key, padding=padding
+        )
+        video = augmentation.augment_pair(
+            expert.observation, expert.successor, video_key, padding=padding
+        )
         target = apply(embedding, state.rewarder.target, video[1])
 
         def loss(params: tuple[Params, Params]) -> tuple[Array, tuple[Array, Metrics]]:
@@ -285,13 +289,6 @@ def make_update_step(
         return state, {**cloning_metrics, **metrics}
 
     return bcvlr_step
-
-
-def _shift(first: Any, second: Any, key: Array, padding: int) -> list[Array]:
-    """Shifts both observations alike, or what moves would be lost in it."""
-    moments = jnp.concatenate([first, second], axis=-1)
-    moments = augmentation.augment(moments, key, padding=padding)
-    return jnp.split(moments, 2, axis=-1)
 
 
 def _modules(

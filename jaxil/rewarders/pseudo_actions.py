@@ -143,17 +143,15 @@ def with_cloning(
         assert expert is not None
         assert view.unshifted_successor is not None
         chex.assert_axis_dimension(expert.observation, 0, expert_batch_size)
-        chex.assert_equal_shape([view.unshifted, view.unshifted_successor])
         inner, metrics = rewarder.update(
             state.inner, learner, *inner_samples(view, expert), key
         )
-        # One shift for both observations, or what moves would be lost in it.
-        moments = augmentation.augment(
-            jnp.concatenate([view.unshifted, view.unshifted_successor], axis=-1),
+        pair = augmentation.augment_pair(
+            view.unshifted,
+            view.unshifted_successor,
             jax.random.fold_in(key, _OWN_KEY),
             padding=agent.shift_padding,
         )
-        pair = jnp.split(moments, 2, axis=-1)
 
         def loss(params: Params) -> Array:
             inferred = apply(models, params, *pair)

@@ -123,3 +123,18 @@ class RandomShiftTest(chex.TestCase):
             augmentation.random_shift(
                 jnp.zeros((4, 4, 3)), jax.random.key(0), padding=1
             )
+
+
+def test_a_pair_moves_as_one_and_states_stay():
+    images = probe_images(6, 8, 8, 3)
+    key = jax.random.key(0)
+    first, second = augmentation.augment_pair(images, images, key, padding=2)
+    np.testing.assert_array_equal(first, second)
+    np.testing.assert_array_equal(
+        first, augmentation.random_shift(images, key, padding=2)
+    )
+    states = jnp.arange(6.0).reshape(2, 3)
+    for got in augmentation.augment_pair(states, states, key, padding=2):
+        np.testing.assert_array_equal(got, states)
+    with pytest.raises(AssertionError):
+        augmentation.augment_pair(images, images[:3], key, padding=2)
