@@ -42,6 +42,7 @@ SETTINGS = {
         "num_iterations": 50,
         "target_update_steps": 20,
         "return_scale": 10.0,
+        "num_components": 0,
     },
 }
 
