@@ -9,8 +9,8 @@ shadows. Other deviations from the paper:
   small moving body is only a few pixels at 48x48.
 - The squared pre-tanh mean is penalised, since small actors saturate permanently.
   Beside P-SIL's small rewards that weight is a hundred times as heavy, and with it
-  `walker_stand` learned to lie still on state vectors and `finger_spin` nothing, so it
-  is smaller there. From pixels P-SIL has not learned to stand with either.
+  `walker_stand` learned to lie still on state vectors, and `finger_spin` nothing in 33k
+  frames, so it is smaller there. From pixels P-SIL has learned to stand with neither.
 - The average of the policies of about the last 1000 updates is evaluated and kept
   (`policy_tau`), since the newest falls back between evaluations. Training never
   uses the average.
