@@ -46,7 +46,7 @@ _GRADIENT_PENALTIES = {("pdac", "cartpole_swingup"): 1.0}
 # Frames of a run, and agent steps over which learning rates fall.
 _FALLING_RATES = {
     "cartpole_swingup": (300_000, 75_000),
-    "finger_spin": (300_000, 125_000),
+    "finger_spin": (400_000, 125_000),
     "walker_walk": (600_000, 250_000),
 }
 _WALKERS = ("walker_stand", "walker_walk", "walker_run")
