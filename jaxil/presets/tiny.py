@@ -32,6 +32,7 @@ shadows. Other deviations from the paper:
 - cartpole_swingup repeats actions 4 times: with 2, a pole at 1 rad/s moves a quarter of
   a pixel between frames, which hides its speed, and agents only learned to spin it;
   with 8, none learned to balance it. P-DAC's gradient penalty has weight 1 there.
+  Batches of 32 learn it from as many frames as batches of 64, in half the time.
 - Learning rates fall on cartpole_swingup, finger_spin and walker_walk: agents that walk
   fall over again and again at the first rate (457 of 961 at 500k frames), and less at
   the last.
@@ -42,6 +43,7 @@ from jaxil.errors import Fault, UsageError
 
 _ACTION_REPEATS = {"cartpole_swingup": 4}
 _CAMERAS = {"cartpole_swingup": "lookatcart"}
+_BATCHES = {"cartpole_swingup": 32}
 _GRADIENT_PENALTIES = {("pdac", "cartpole_swingup"): 1.0}
 # Frames of a run, and agent steps over which learning rates fall.
 _FALLING_RATES = {
@@ -91,7 +93,7 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     config.encoder.subtract_mean_image = True
     config.shift_padding = 2
     config.hidden_dim = 256
-    config.batch_size = 64
+    config.batch_size = _BATCHES.get(task, 64)
     config.update_every_steps = 1
     config.learning_rate = 3e-4
     if task in _FALLING_RATES:
@@ -111,7 +113,7 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     if "width" in own:
         own.width = 8
     if own:
-        own.batch_size = _DISCRIMINATOR_BATCHES.get(method, 64)
+        own.batch_size = _DISCRIMINATOR_BATCHES.get(method, config.batch_size)
         own.learning_rate = 3e-4
     transport = config.get("sinkhorn", {})
     if task in _JUDGED_BY_COMPONENTS.get(rewarder, ()):
@@ -121,7 +123,7 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     if "target_update_steps" in transport:
         transport.target_update_steps = 5_000 if config.action_repeat == 2 else 2_500
     config.reward_refresh_steps = 2_500
-    config.eval_every_frames = 10_000
+    config.eval_every_frames = 20_000
     config.checkpoint_every_frames = 10_000
     for section, sizes in _SMALL.items():
         if section in config:
