@@ -33,14 +33,14 @@ FIELDS: dict[str, Field] = {
     "seed": Field(0, "seeds NumPy and JAX", 0, 2**31 - 1),
     # What the agent sees and does.
     "observation": Field(
-        "pixels", "state: for experts that learn fast", choices=("pixels", "state")
+        "pixels", "state: the simulator's, for experts", choices=("pixels", "state")
     ),
     "action_repeat": Field(2, "frames of one agent step; 2 in the paper", 1, 100),
     "image_size": Field(84, "pixels of a side; 84 in the paper", 8, 1024),
     "frame_stack": Field(3, "frames of one observation; 3 in the paper", 1, 16),
     "render_quality": Field(
         "paper",
-        "paper: dm_control's own; fast: no shadows, for software rendering",
+        "dm_control's own; fast: no shadows; smooth: fast, from twice the size",
         choices=("paper", "fast", "smooth"),
     ),
     "camera": Field("", "its name or number in the task; empty: DrQ-v2's"),
@@ -129,10 +129,10 @@ FIELDS: dict[str, Field] = {
         False, "keeps a copy of the replay's frames on the device; only speed changes"
     ),
     "updates_per_dispatch": Field(
-        1, "updates sent to the device at once; the policy lags by one less", 1, 1_000
+        1, "sent to the device at once; the policy lags by up to N - 1", 1, 1_000
     ),
     "num_environments": Field(
-        1, "side by side, each in a process; the policy lags by one less", 1, 64
+        1, "in processes side by side; the policy lags by up to N - 1", 1, 64
     ),
     "compute_dtype": Field(
         "float32", "of convolutions and trunks", choices=("float32", "bfloat16")

@@ -72,13 +72,14 @@ class Method(NamedTuple):
       rank: where it stands in tables and legends: small numbers first.
       sections: its config sections. Their fields are keyword arguments of
         `make_rewarder`, or of `make_update_step` where there is one.
-      make_rewarder: (AgentSpec, **fields) -> Rewarder: a function of its file.
-      make_update_step: (Learner, **fields) -> UpdateStep: a function of its file that
-        replaces the learner's own step; None for the learner's.
+      make_rewarder: name of a function of its file: (AgentSpec, **fields) -> Rewarder.
+      make_update_step: name of a function of its file that replaces the learner's own
+        step: (Learner, **fields) -> UpdateStep; None for the learner's.
       uses_demonstrations: whether it imitates anything.
       sees_actions: whether it reads the expert's actions, or the field that decides.
       plays: whether the agent acts in the environment; a method that does not learns
-        from demonstrations alone, and its frames count updates.
+        from demonstrations alone, and an update counts as the frames that an agent
+        would play for it.
       total_updates: length of a run of a method that does not play.
       needs_pixels: whether it cannot learn from state vectors.
       metrics: columns of train.csv beside those of the learner.
@@ -112,7 +113,7 @@ DISCRIMINATOR = {
 }
 COMPONENTS = Field(
     0,
-    "principal components of each frame that are judged; 0, the paper's: features",
+    "principal components of each frame to judge or compare; 0, the paper's: features",
     0,
     1024,
 )

@@ -116,7 +116,7 @@ class Run(Parts):
             padded = np.zeros((size, *observations.shape[1:]), observations.dtype)
             padded[:count] = observations
             # The state is donated at each update: its parameters are read afresh.
-            encoder, actor, _ = self.state.params
+            encoder, actor = self.state.newest_policy
             key = self.exploration_key
             sampled = self.agent.sample_action(encoder, actor, padded, key, steps)
             actions[~uniform] = np.asarray(sampled)[:count][~uniform]

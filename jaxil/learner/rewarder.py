@@ -46,11 +46,11 @@ class AgentView(NamedTuple):
       features: critic trunk features of them, without gradient. Shape [B, D].
       action: shape [B, A].
       unshifted: the pixels as they were stored. Shape [B, H, W, C].
-      successor: the observations one step later, augmented, like `observation`, and
-      successor_features: their features, like `features`.
-      unshifted_successor: the same observations as they were stored, for methods that
-        shift an observation and its successor alike. These three are None unless the
-        method has `samples_successors`.
+      successor: the observations one step later, augmented. Like `observation`; None
+        unless the method has `samples_successors`, as the next two.
+      successor_features: their features. Like `features`.
+      unshifted_successor: they as they were stored, for methods that shift an
+        observation and its successor alike. Like `unshifted`.
     """
 
     observation: Array

@@ -94,7 +94,7 @@ def apply_gradients(
     """Returns `module` after one optimiser step."""
     updates, opt_state = optimiser.update(gradients, module.opt_state, module.params)
     params = optax.apply_updates(module.params, updates)
-    return ModuleState(params=params, opt_state=opt_state)
+    return module.replace(params=params, opt_state=opt_state)
 
 
 def copy_params(params: Params) -> Params:

@@ -31,8 +31,8 @@ def make_coded_rewarder(
     *,
     num_components: int,
     compare: Compare,
-    plan: Compare | None,
-    return_scale: float | None,
+    plan: Compare,
+    return_scale: float,
 ) -> Rewarder:
     """Returns a rewarder of whole episodes under principal components of the frames.
 
@@ -43,8 +43,8 @@ def make_coded_rewarder(
       agent: only its frame stack is used.
       num_components: C, of each of the F frames of an observation.
       compare: see `make_comparing_rewarder`, as `plan` and `return_scale`.
-      plan: the transport plan behind the rewards; None without one.
-      return_scale: minus the first episode's return; None: rewards are not scaled.
+      plan: the transport plan behind the rewards.
+      return_scale: minus the first episode's return.
     """
     frame_stack = agent.frame_stack
 
@@ -60,7 +60,7 @@ def make_coded_rewarder(
             expert_features=jnp.zeros(
                 (spec.num_demonstrations, spec.expert_steps + 1, width)
             ),
-            scale=jnp.ones(()) if return_scale is None else jnp.zeros(()),
+            scale=jnp.zeros(()),
         )
 
     def look(
@@ -72,14 +72,13 @@ def make_coded_rewarder(
         del learner
 
         def fit() -> CodedState:
-            code = codes.observe(state.code, episode, expert_episodes)
+            code = codes.fix(codes.fit(state.code, episode, expert_episodes))
             features = jax.lax.map(
                 lambda frames: codes.encode_episode(
                     code, frames, frame_stack=frame_stack
                 ),
                 jnp.asarray(expert_episodes.frames),
             )
-            code = code.replace(is_fixed=jnp.ones((), bool))
             return state.replace(code=code, expert_features=features)
 
         return jax.lax.cond(state.code.is_fixed, lambda: state, fit)

@@ -26,7 +26,7 @@ class FrameCode(struct.PyTreeNode):
       mean: of demonstrations' frames, in [0, 1]. Shape [P], with P = H W 3.
       sketch: see `components.merge`. Shape [K, P].
       num_rows: frames that it was fitted on. Shape [].
-      is_fixed: whether rewards or updates have used it. Shape [], bool.
+      is_fixed: set by P-DAC's first update, by P-SIL's first episode. Shape [], bool.
     """
 
     mean: Array
@@ -52,8 +52,21 @@ def init_code(
 def observe(code: FrameCode, episode: Episode, experts: ExpertEpisodes) -> FrameCode:
     """Returns the code fitted to one more episode, unless it is fixed."""
     return jax.lax.cond(
-        code.is_fixed, lambda: code, lambda: _fit(code, episode, experts)
+        code.is_fixed, lambda: code, lambda: fit(code, episode, experts)
     )
+
+
+def fit(code: FrameCode, episode: Episode, experts: ExpertEpisodes) -> FrameCode:
+    """Returns the code fitted to one more episode, and first to the demonstrations."""
+    code = jax.lax.cond(
+        code.num_rows == 0.0, lambda: _begin(code, experts), lambda: code
+    )
+    return _merge(code, _sample_episode(episode.frames))
+
+
+def fix(code: FrameCode) -> FrameCode:
+    """Returns the code as it stays from now on."""
+    return code.replace(is_fixed=jnp.ones((), bool))
 
 
 def encode_frames(code: FrameCode, frames: Array) -> Array:
@@ -90,13 +103,6 @@ def encode_episode(code: FrameCode, frames: Array, *, frame_stack: int) -> Array
     codes = encode_frames(code, frames)
     codes = stacking.stack_frames(codes, frame_stack=frame_stack)
     return codes / jnp.sqrt(frame_stack)
-
-
-def _fit(code: FrameCode, episode: Episode, experts: ExpertEpisodes) -> FrameCode:
-    code = jax.lax.cond(
-        code.num_rows == 0.0, lambda: _begin(code, experts), lambda: code
-    )
-    return _merge(code, _sample_episode(episode.frames))
 
 
 def _begin(code: FrameCode, experts: ExpertEpisodes) -> FrameCode:

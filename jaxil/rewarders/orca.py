@@ -47,7 +47,7 @@ def make_rewarder(
     to the demonstration with the largest return. Rewards are in [0, 1] and not scaled.
 
     Args:
-      agent: only its encoder and the actor's trunk are used.
+      agent: its encoder, actor's trunk and frame stack are used.
       temperature: see `coverage_rewards`.
       num_waypoints: frames of a demonstration that have to be covered.
       target_update_steps: agent steps between target copies.

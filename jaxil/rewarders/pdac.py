@@ -66,7 +66,7 @@ def make_rewarder(
     image from the start; the critic's features know of what rewards have taught.
 
     Args:
-      agent: only its encoder and the critic's trunk are used.
+      agent: its encoder, critic's trunk, frame stack and shift are used.
       hidden_dim: width of the discriminator.
       learning_rate: of its Adam.
       gradient_penalty: its weight.
@@ -142,8 +142,8 @@ def make_rewarder(
             # Not augmented: a shift would move the code, and the code is all there is.
             expert_features = encode(code, jnp.asarray(expert.observation))
             features = encode(code, view.unshifted[:batch_size])
-            code = code.replace(is_fixed=jnp.ones((), bool))
-        module, metrics = update_discriminator(
+            code = codes.fix(code)
+        judged, metrics = update_discriminator(
             state,
             logits,
             inputs(expert_features, expert.action),
@@ -152,7 +152,7 @@ def make_rewarder(
             penalty_weight=gradient_penalty,
             optimiser=optimiser,
         )
-        return JudgeState(module.params, module.opt_state, code), metrics
+        return judged.replace(code=code), metrics
 
     def features_of(state: JudgeState, learner: LearnerParams, frames: Array) -> Array:
         if state.code is not None:

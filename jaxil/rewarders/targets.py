@@ -46,7 +46,7 @@ def make_target_rewarder(
     episode of all, when the live networks are still as initialised.
 
     Args:
-      agent: only its encoder and the actor's trunk are used.
+      agent: its encoder, actor's trunk and frame stack are used.
       compare: see `make_comparing_rewarder`, as `plan` and `return_scale`.
       plan: the transport plan behind the rewards; None without one.
       target_update_steps: agent steps between copies.

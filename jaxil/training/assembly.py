@@ -1,4 +1,4 @@
-"""From a checked config to the parts of a run: environments, learner, rewarder."""
+"""From a checked config to a run's environments, replay and demonstrations."""
 
 import functools
 from collections.abc import Callable, Mapping

@@ -30,7 +30,7 @@ from jaxil.training.workdir import writes_to
 _ENCODER_SEED = 0
 _RANDOM_POLICY_SEED = 2_000_029
 _RANDOM_EPISODES = 5
-_EPSILON, _NUM_ITERATIONS = 0.01, 100  # as P-SIL's; see `jaxil/config.py`
+_EPSILON, _NUM_ITERATIONS = 0.01, 100  # as P-SIL's; see `jaxil/methods.py`
 _FEATURE_DIM, _STATE_DIM = 50, 256
 # Moments of an episode that are compared, evenly spaced, and episodes of one side:
 # the cost matrix is [640, 640] at most.

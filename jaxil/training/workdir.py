@@ -130,7 +130,7 @@ def opened(workdir: pathlib.Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def writes_to(workdir: pathlib.Path) -> Iterator[None]:
-    """Turns an OSError in the block, where a run's own files are written, into one.
+    """Turns an OSError of the block, which writes a run's files, into a RunFolderError.
 
     Raises:
       RunFolderError: names the fault, the newest checkpoint and what to do.
