@@ -1,6 +1,6 @@
 """The learner's state: everything that training changes."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -88,10 +88,13 @@ def init_module(params: Params, optimiser: optax.GradientTransformation) -> Modu
     return ModuleState(params=params, opt_state=optimiser.init(params))
 
 
+Module = TypeVar("Module", bound=ModuleState)
+
+
 def apply_gradients(
-    module: ModuleState, gradients: Params, optimiser: optax.GradientTransformation
-) -> ModuleState:
-    """Returns `module` after one optimiser step."""
+    module: Module, gradients: Params, optimiser: optax.GradientTransformation
+) -> Module:
+    """Returns `module` after one optimiser step, what else it holds as it was."""
     updates, opt_state = optimiser.update(gradients, module.opt_state, module.params)
     params = optax.apply_updates(module.params, updates)
     return module.replace(params=params, opt_state=opt_state)

@@ -12,6 +12,7 @@ from jax import Array
 from jaxil.learner.rewarder import AgentSpec, AgentView, Rewarder, RewarderState, Spec
 from jaxil.learner.state import (
     LearnerParams,
+    Module,
     ModuleState,
     apply_gradients,
     init_module,
@@ -34,7 +35,7 @@ Pair = tuple[Array, Array]  # of what is seen of o_t and of o_{t+1}
 
 
 def update_discriminator(
-    state: ModuleState,
+    state: Module,
     logits: Logits,
     expert: Any,
     agent: Any,
@@ -42,7 +43,7 @@ def update_discriminator(
     *,
     penalty_weight: float,
     optimiser: optax.GradientTransformation,
-) -> tuple[ModuleState, Metrics]:
+) -> tuple[Module, Metrics]:
     """Takes one step towards telling expert (label 1) from agent (label 0).
 
         max_D  mean log D(e) + mean log(1 - D(a)) - penalty_weight * GP
