@@ -166,7 +166,7 @@ def _write(
                 output, states.StateDemonstrations(**arrays, metadata=metadata)
             )
         else:
-            seconds = environment.decision_seconds
+            seconds = environment.step_seconds
             recording = Recording(
                 "jaxil pixels",
                 values.num_episodes,

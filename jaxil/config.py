@@ -1,7 +1,7 @@
 """All settings with their defaults and rules, and the one place where they are checked.
 
 Durations end in their unit: `_frames` are environment frames, before action repeat;
-`_steps` are the agent's decisions. Fields of a single method stand beside its rewarder
+`_steps` are agent steps. Fields of a single method stand beside its rewarder
 (see `jaxil.methods`).
 """
 
@@ -158,8 +158,8 @@ FREE_FIELDS = (
     "video_every_evals",
     "logger",
 )
-# Fields that must end with a decision.
-_WHOLE_DECISIONS = (
+# Fields that must end with an agent step.
+_WHOLE_STEPS = (
     "total_frames",
     "seed_frames",
     "eval_every_frames",
@@ -260,7 +260,7 @@ def _problems(
         for fault in _field_problems(name, field, value):
             bad.add(name)
             yield fault
-    for name in _WHOLE_DECISIONS:
+    for name in _WHOLE_STEPS:
         value, repeat = read(config, name), config.action_repeat
         if not {name, "action_repeat"} & bad and value % repeat:
             nearest = max(round(value / repeat), 1) * repeat

@@ -21,7 +21,7 @@ class Environment(Protocol):
         ...
 
     @property
-    def decision_seconds(self) -> float | None:
+    def step_seconds(self) -> float | None:
         """Simulated duration of an agent step; None if unknown."""
         ...
 

@@ -188,7 +188,7 @@ class PixelEnvironment(dm_env.Environment):
         return math.ceil(self._frame_limit / self._action_repeat)
 
     @property
-    def decision_seconds(self) -> float | None:
+    def step_seconds(self) -> float | None:
         """Simulated duration of an agent step; None if unknown."""
         seconds = getattr(self._simulator, "frame_seconds", None)
         return None if seconds is None else seconds * self._action_repeat

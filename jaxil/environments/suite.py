@@ -162,7 +162,7 @@ class SuiteEnvironment(PixelEnvironment):
         return self._simulator._step_limit
 
     @property
-    def decision_seconds(self) -> float:
+    def step_seconds(self) -> float:
         """Simulated duration of an agent step."""
         return self._simulator.control_timestep() * self._action_repeat
 

@@ -110,7 +110,7 @@ def timing(task: str, action_repeat: int) -> tuple[float | None, int | None]:
     """Returns an agent step's seconds, and an episode's steps; None if unknown."""
     settings = {"action_repeat": action_repeat, "image_size": 8}
     environment = make_environment(task, seed=0, **settings)
-    found = environment.decision_seconds, environment.episode_steps
+    found = environment.step_seconds, environment.episode_steps
     environment.close()
     return found
 

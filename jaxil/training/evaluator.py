@@ -122,7 +122,7 @@ class Evaluator:
             "task_rewards": episode.rewards,
             "imitation_rewards": np.asarray(self._agent.rewards(*arguments)),
         }
-        seconds = self.environment.decision_seconds
+        seconds = self.environment.step_seconds
         if seconds is not None:
             found["step_seconds"] = np.asarray(seconds)
         if self._agent.plan is not None:

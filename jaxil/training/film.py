@@ -78,7 +78,7 @@ def sides(
       Stopped: a stop was asked for.
     """
     views, moments = zip(*evaluation.recorded)
-    seconds = environment.decision_seconds
+    seconds = environment.step_seconds
     if not isinstance(environment, Restorable):
         frames = np.stack(moments)
     else:

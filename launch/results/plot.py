@@ -13,6 +13,7 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -24,6 +25,7 @@ from jaxil.reporting.figures import TASKS
 
 _HERE = pathlib.Path(__file__).parent
 _EPISODE_FRAMES = 1000
+_DEMONSTRATIONS = 10  # whose return is the expert's
 # Field that was swept: x label, row of the benchmark, y label.
 _REWARD = ("reward_ms", "rewards of an episode, ms")
 _PANELS = {
@@ -56,7 +58,8 @@ _KINDS = {
 # Words in the names of runs that were made with changed code.
 _EXPERIMENTS = {"pca32", "pca64", "dynamics", "cloning1", "cloning3", "cloning10"}
 _EXPERIMENTS |= {"beside", "layernorm", "centred", "std10k", "greedy", "reconstruction"}
-_EXPERIMENTS |= {"switched", "temporal", "inverse", "transitions"}
+_EXPERIMENTS |= {"switched", "temporal", "inverse", "transitions", "twojudges"}
+_EXPERIMENTS |= {"pretrained"}
 _EXPERIMENTS |= {"lowrate", "scaled", "gradients", "nstep3", "decay"}
 _EXPERIMENTS |= {"noaug", "demos1", "demos50", "actions", "time"}  # of the claims
 # Fields that do not change what a run learns.
@@ -104,12 +107,15 @@ def _flat(fields: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def plot_overview() -> None:
     """Plots a panel for each task: every run, coloured by its kind."""
-    runs = collections.defaultdict(list)
+    runs, experts = collections.defaultdict(list), collections.defaultdict(list)
     for path in sorted(_HERE.glob("*/eval.csv")):
         config = json.loads((path.parent / "config.json").read_text())["config"]
         kind, table = kind_of(path.parent.name, config), read_csv(path)
         if len(table["frame"]):  # some ended before an evaluation
-            runs[config["task"]].append((list(_KINDS).index(kind), kind, table))
+            task = config["task"]
+            runs[task].append((list(_KINDS).index(kind), kind, table))
+            if config["demonstrations"]["num_episodes"] == _DEMONSTRATIONS:
+                experts[task].append(table["expert_task_return_mean"][-1])
     panels = _axes(2, 4, width=3.0, height=2.5)
     for axes, task in zip(panels, TASKS):
         for _, kind, table in sorted(runs[task], key=lambda run: -run[0]):
@@ -118,9 +124,9 @@ def plot_overview() -> None:
             marker = "" if len(x) > 1 else "o"
             look = {"color": colour, "lw": width, "marker": marker, "ms": 3}
             axes.plot(x, y, style, label=label, **look)
-        experts = [table["expert_task_return_mean"][-1] for *_, table in runs[task]]
-        if experts:
-            axes.axhline(max(experts), color="#222222", ls=":", lw=1.2, label="expert")
+        if experts[task]:  # the first runs had worse ones
+            expert = np.nanmax(experts[task])
+            axes.axhline(expert, color="#222222", ls=":", lw=1.2, label="expert")
         else:
             words = {"ha": "center", "va": "center", "color": "#777777"}
             axes.text(0.5, 0.5, "no evaluation yet", transform=axes.transAxes, **words)
