@@ -38,7 +38,7 @@ NETWORKS = make_tiny_networks()
 
 def make_agent(frame_stack: int = 1, shift_padding: int = 0) -> AgentSpec:
     """Returns what methods are told of the agent of `NETWORKS`."""
-    return AgentSpec(NETWORKS, FEATURE_DIM, frame_stack, shift_padding)
+    return AgentSpec(NETWORKS, frame_stack, shift_padding)
 
 
 def make_spec(
@@ -46,7 +46,7 @@ def make_spec(
 ) -> Spec:
     """Returns the sizes that rewarders for `NETWORKS` are told."""
     shape = (SIDE, SIDE, 3 * frame_stack)
-    return Spec(ACTION_DIM, FEATURE_DIM, num_demonstrations, expert_steps, shape)
+    return Spec(ACTION_DIM, num_demonstrations, expert_steps, shape)
 
 
 @functools.cache

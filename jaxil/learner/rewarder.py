@@ -27,15 +27,18 @@ class AgentSpec(NamedTuple):
 
     Attributes:
       networks: the agent's.
-      feature_dim: D.
       frame_stack: frames in an observation.
       shift_padding: of the random shift, in pixels; 0 for no augmentation.
     """
 
     networks: AgentNetworks
-    feature_dim: int
     frame_stack: int
     shift_padding: int
+
+    @property
+    def feature_dim(self) -> int:
+        """D, the width of the trunks."""
+        return self.networks.actor.feature_dim
 
 
 class AgentView(NamedTuple):
@@ -67,14 +70,12 @@ class Spec(NamedTuple):
 
     Attributes:
       action_dim: A.
-      feature_dim: D.
       num_demonstrations: K; 0 without demonstrations.
       expert_steps: N, agent steps in a demonstration.
       observation_shape: (H, W, C), or (S,).
     """
 
     action_dim: int
-    feature_dim: int
     num_demonstrations: int
     expert_steps: int
     observation_shape: tuple[int, ...]

@@ -72,7 +72,7 @@ def make_rewarder(
     discriminator = Discriminator(hidden_dim)
 
     def init_params(key: Array, spec: Spec) -> Params:
-        return discriminator.init(key, jnp.zeros((1, 2 * spec.feature_dim)))
+        return discriminator.init(key, jnp.zeros((1, 2 * agent.feature_dim)))
 
     def see(learner: LearnerParams, observation: Array) -> Array:
         return critic_features(

@@ -94,7 +94,7 @@ def make_rewarder(
 
     def init(key: Array, spec: Spec, learner: LearnerParams) -> JudgeState:
         del learner
-        code, width = None, spec.feature_dim
+        code, width = None, agent.feature_dim
         if num_components:
             code = codes.init_code(
                 spec.observation_shape,

@@ -101,7 +101,7 @@ def with_cloning(
     """
     encoder, actor, critic = agent.networks
     models = InverseModels(
-        encoder, actor.feature_dim, head_dim, actor.action_dim, num_models
+        encoder, agent.feature_dim, head_dim, actor.action_dim, num_models
     )
     optimiser = optax.adam(model_learning_rate)
     expert_batch_size = max(rewarder.expert_batch_size, num_pairs)

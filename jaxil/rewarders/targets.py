@@ -59,7 +59,7 @@ def make_target_rewarder(
 
     def init(key: Array, spec: Spec, learner: LearnerParams) -> TargetState:
         del key
-        shape = (spec.num_demonstrations, spec.expert_steps + 1, spec.feature_dim)
+        shape = (spec.num_demonstrations, spec.expert_steps + 1, agent.feature_dim)
         return TargetState(
             target_encoder=copy_params(learner.encoder),
             target_actor=copy_params(learner.actor),

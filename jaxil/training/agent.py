@@ -157,7 +157,6 @@ def make_rewarder(config: Config, networks: AgentNetworks) -> Rewarder:
     method = methods.get(config.method)
     agent = AgentSpec(
         networks=networks,
-        feature_dim=config.feature_dim,
         frame_stack=stack_size(config),
         shift_padding=config.shift_padding,
     )
@@ -209,7 +208,6 @@ def make_agent(
     frames = None if demonstrations is None else demonstrations.frames
     spec = Spec(
         action_dim=action_dim,
-        feature_dim=config.feature_dim,
         num_demonstrations=0 if frames is None else frames.shape[0],
         expert_steps=0 if frames is None else frames.shape[1] - 1,
         observation_shape=observation.shape,

@@ -18,7 +18,6 @@ SIDE, CHANNELS, ACTIONS, BATCH, PADDING = 12, 6, 2, 8, 2
 TAU, NOISE_CLIP, LEARNING_RATE = 0.05, 0.3, 3e-3
 SPEC = Spec(
     action_dim=ACTIONS,
-    feature_dim=5,
     num_demonstrations=2,
     expert_steps=3,
     observation_shape=(SIDE, SIDE, CHANNELS),
@@ -33,7 +32,7 @@ NETWORKS = make_tiny_networks(
 )
 
 # Made once: a learner is compiled once for all tests that share it.
-AGENT = AgentSpec(NETWORKS, SPEC.feature_dim, frame_stack=2, shift_padding=PADDING)
+AGENT = AgentSpec(NETWORKS, frame_stack=2, shift_padding=PADDING)
 DRQV2 = drqv2.make_rewarder(AGENT)
 PDAC = pdac.make_rewarder(
     AGENT,

@@ -17,7 +17,7 @@ from jaxil.maths.types import Batch
 from jaxil.rewarders import drqv2
 from tests.tiny_agent import make_agent, make_tiny_networks
 
-SPEC = Spec(2, 5, num_demonstrations=0, expert_steps=0, observation_shape=(12, 12, 6))
+SPEC = Spec(2, num_demonstrations=0, expert_steps=0, observation_shape=(12, 12, 6))
 
 
 def tiny_learner():

@@ -55,7 +55,7 @@ def compiled(function):
 
 def make_agent(kind="state", shift_padding=0):
     networks = make_tiny_networks(feature_dim=16, hidden_dim=32, observation=kind)
-    return AgentSpec(networks, 16, 1, shift_padding)
+    return AgentSpec(networks, 1, shift_padding)
 
 
 def make_learner(rewarder, kind="state", shift_padding=0):
@@ -76,7 +76,7 @@ def shape_of(kind):
 
 
 def make_state(learner, kind="state"):
-    spec = Spec(2, 16, 2, expert_steps=4, observation_shape=shape_of(kind))
+    spec = Spec(2, 2, expert_steps=4, observation_shape=shape_of(kind))
     example = np.zeros(shape_of(kind), np.float32 if kind == "state" else np.uint8)
     init = compiled(lambda key: init_train_state(learner, key, example, spec))
     return init(jax.random.key(0))

@@ -16,7 +16,7 @@ def learner_of(make_rewarder, observation, shift_padding, settings):
     networks = make_tiny_networks(
         feature_dim=16, hidden_dim=32, observation=observation
     )
-    agent = AgentSpec(networks, 16, 1, shift_padding)
+    agent = AgentSpec(networks, 1, shift_padding)
     return Learner(
         networks=networks,
         rewarder=make_rewarder(agent, **settings),
@@ -32,7 +32,7 @@ def learner_of(make_rewarder, observation, shift_padding, settings):
 def state_of(learner, observation):
     shape = (STATE_DIM,) if observation == "state" else (SIDE, SIDE, 3)
     dtype = np.float32 if observation == "state" else np.uint8
-    spec = Spec(2, 16, num_demonstrations=1, expert_steps=4, observation_shape=shape)
+    spec = Spec(2, num_demonstrations=1, expert_steps=4, observation_shape=shape)
     return init_train_state(learner, jax.random.key(0), np.zeros(shape, dtype), spec)
 
 

@@ -23,7 +23,7 @@ NETWORKS = make_tiny_networks(feature_dim=8, hidden_dim=32, channels=(8,))
 def make_learner(shift_padding=0, learning_rate=3e-3):
     return Learner(
         networks=NETWORKS,
-        rewarder=bc.make_rewarder(AgentSpec(NETWORKS, 8, 1, shift_padding), **SETTINGS),
+        rewarder=bc.make_rewarder(AgentSpec(NETWORKS, 1, shift_padding), **SETTINGS),
         learning_rate=learning_rate,
         critic_target_tau=0.01,
         noise_clip=0.3,
@@ -34,7 +34,7 @@ def make_learner(shift_padding=0, learning_rate=3e-3):
 
 
 def make_state(learner):
-    spec = Spec(2, 8, num_demonstrations=1, expert_steps=4, observation_shape=SHAPE)
+    spec = Spec(2, num_demonstrations=1, expert_steps=4, observation_shape=SHAPE)
     return init_train_state(learner, jax.random.key(0), np.zeros(SHAPE, np.uint8), spec)
 
 

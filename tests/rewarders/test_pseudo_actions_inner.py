@@ -53,7 +53,7 @@ def test_without_weight_the_agent_learns_as_with_the_inner_method(name, kind):
 def test_the_inner_method_rewards_plans_and_remembers_as_it_does_alone(name):
     inner, ours = make_methods(name)
     params = make_state(make_learner(inner)).params
-    spec = Spec(2, 16, 2, expert_steps=4, observation_shape=(STATE_DIM,))
+    spec = Spec(2, 2, expert_steps=4, observation_shape=(STATE_DIM,))
     episode = make_episode(observations(0, "state", 6))
     experts = make_experts(observations(1, "state", 2, 5))
 
