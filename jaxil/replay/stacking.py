@@ -18,11 +18,11 @@ def gather_stacks(frames: np.ndarray, indices: np.ndarray) -> np.ndarray:
     """Gathers frames and folds each stack of them into the channels.
 
     Args:
-      frames: [N, H, W, C], or [N, S] if K is 1.
-      indices: [..., K], in [0, N): the frames of each stack, oldest first.
+      frames: [N, H, W, C], or [N, S] if F is 1.
+      indices: [..., F], in [0, N): the frames of each stack, oldest first.
 
     Returns:
-      A new array [..., H, W, K * C], or [..., S], in C order.
+      A new array [..., H, W, F * C], or [..., S], in C order.
     """
     *axes, num_stacked = indices.shape
     if num_stacked == 1:

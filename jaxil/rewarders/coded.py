@@ -17,7 +17,7 @@ class CodedState(struct.PyTreeNode):
 
     Attributes:
       code: fitted to the demonstrations and the first episode, then fixed.
-      expert_features: demonstrations in that code. Shape [K, N + 1, F * C].
+      expert_features: demonstrations in that code. Shape [K, N + 1, F * J].
       scale: factor on rewards, set by the first episode; 0 before. Shape [].
     """
 
@@ -41,7 +41,7 @@ def make_coded_rewarder(
 
     Args:
       agent: only its frame stack is used.
-      num_components: C, of each of the F frames of an observation.
+      num_components: J, of each of the F frames of an observation.
       compare: see `make_comparing_rewarder`, as `plan` and `return_scale`.
       plan: the transport plan behind the rewards.
       return_scale: minus the first episode's return.

@@ -24,7 +24,7 @@ class FrameCode(struct.PyTreeNode):
 
     Attributes:
       mean: of demonstrations' frames, in [0, 1]. Shape [P], with P = H W 3.
-      sketch: see `components.merge`. Shape [K, P].
+      sketch: see `components.merge`. Shape [J, P].
       num_rows: frames that it was fitted on. Shape [].
       is_fixed: set by P-DAC's first update, by P-SIL's first episode. Shape [], bool.
     """
@@ -70,7 +70,7 @@ def fix(code: FrameCode) -> FrameCode:
 
 
 def encode_frames(code: FrameCode, frames: Array) -> Array:
-    """Returns the codes of frames: [M, H, W, 3] to [M, K].
+    """Returns the codes of frames: [M, H, W, 3] to [M, J].
 
     NaN before the first episode, so that a loop without `observe` ends at once.
     """
@@ -80,7 +80,7 @@ def encode_frames(code: FrameCode, frames: Array) -> Array:
 
 
 def encode(code: FrameCode, observation: Array, *, frame_stack: int) -> Array:
-    """Returns the codes of observations: [B, H, W, F * 3] to [B, F * K]."""
+    """Returns the codes of observations: [B, H, W, F * 3] to [B, F * J]."""
     chex.assert_rank(observation, 4)
     *size, channels = observation.shape
     frames = observation.reshape(*size, frame_stack, channels // frame_stack)
@@ -98,7 +98,7 @@ def encode_episode(code: FrameCode, frames: Array, *, frame_stack: int) -> Array
       frame_stack: F.
 
     Returns:
-      Shape [T + 1, F * K].
+      Shape [T + 1, F * J].
     """
     codes = encode_frames(code, frames)
     codes = stacking.stack_frames(codes, frame_stack=frame_stack)
