@@ -10,7 +10,7 @@ shadows. Other deviations from the paper:
 - The squared pre-tanh mean is penalised, since small actors saturate permanently.
   Beside P-SIL's small rewards that weight is a hundred times as heavy, and with it
   `walker_stand` learned to lie still on state vectors, and `finger_spin` nothing in 33k
-  frames, so it is smaller there. With neither did it learn to stand from pixels.
+  frames, so it is smaller there. With neither did P-SIL learn to stand from pixels.
 - The average of the policies of about the last 1000 updates is evaluated and kept
   (`policy_tau`), since the newest falls back between evaluations. Training never
   uses the average.
