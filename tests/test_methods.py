@@ -11,6 +11,7 @@ import pytest
 from jaxil import config as jaxil_config
 from jaxil import methods
 from jaxil.errors import UsageError
+from jaxil.presets import tiny
 from tests.commands import ROOT, SMALL, call, small_run
 from tests.processes import run_python
 from tests.reporting.run_folders import write_run
@@ -91,6 +92,18 @@ def test_defaults_keep_their_own_rules_and_names_lead_to_fields(name):
         assert variation.plain == known[variation.field].default
     assert isinstance(method.sees_actions, bool) or method.sees_actions in known
     assert method.plays or method.total_updates > 0
+
+
+@pytest.mark.parametrize("task", ["cartpole_swingup", "walker_walk"])
+def test_a_method_that_does_not_play_updates_as_often_in_every_preset(task):
+    idle = [name for name in _DECLARED if not methods.get(name).plays]
+    assert idle == ["bc"]
+    for config in (
+        jaxil_config.default_config("bc", task),
+        tiny.get_config(f"bc,{task}"),
+    ):
+        frames_of_an_update = config.update_every_steps * config.action_repeat
+        assert config.total_frames == 55_000 * frames_of_an_update  # of the reference
 
 
 def test_labels_ranks_and_colours_are_unique():

@@ -42,6 +42,7 @@ shadows. Other deviations from the paper:
 """
 
 from jaxil import config as jaxil_config
+from jaxil import methods
 from jaxil.errors import Fault, UsageError
 
 _ACTION_REPEATS = {"cartpole_swingup": 4}
@@ -101,6 +102,9 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     if task in _FALLING_RATES:
         config.total_frames, config.learning_rate_steps = _FALLING_RATES[task]
         config.learning_rate_end = 5e-5
+    declared = methods.get(method)
+    if not declared.plays:  # as many updates as with the paper's settings
+        config.total_frames = declared.total_updates * config.action_repeat
     rewarder = method.removesuffix("_cloning")
     lighter = rewarder == "psil" and task in (*_WALKERS, "finger_spin")
     config.pre_tanh_penalty = 2e-5 if lighter else 2e-3
