@@ -35,7 +35,10 @@ class Dummies:
         self.act = lambda: None  # happens at each agent step
         counters = Counters(num_episodes=first_episode)
         state = _part(
-            params=(None, None, None), rewarder=None, num_updates=np.int32(12)
+            params=(None, None, None),
+            newest_policy=(None, None),
+            rewarder=None,
+            num_updates=np.int32(12),
         )
         state.replace = lambda rewarder: state
         self.rewarder = _part(summary=lambda _: {}, rewards_changed=None)
