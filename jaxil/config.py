@@ -40,7 +40,7 @@ FIELDS: dict[str, Field] = {
     "frame_stack": Field(3, "frames of one observation; 3 in the paper", 1, 16),
     "render_quality": Field(
         "paper",
-        "dm_control's own; fast: no shadows; smooth: fast, from twice the size",
+        "paper: dm_control's; fast: no shadows; smooth: fast, from twice the size",
         choices=("paper", "fast", "smooth"),
     ),
     "camera": Field("", "its name or number in the task; empty: DrQ-v2's"),

@@ -5,13 +5,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from jaxil.learner.rewarder import AgentSpec, AgentView, Spec
-from jaxil.learner.update import Learner, init_train_state
+from jaxil.learner.update import init_train_state
 from jaxil.maths.types import Batch, ExpertBatch
 from jaxil.rewarders import pdac, pdac_cloning, psil, psil_cloning
 from jaxil.rewarders.pseudo_actions import with_cloning
+from tests.rewarders.small_world import learner_with
 from tests.tiny_agent import (
     make_tiny_networks,
     random_actions,
@@ -59,16 +59,7 @@ def make_agent(kind="state", shift_padding=0):
 
 
 def make_learner(rewarder, kind="state", shift_padding=0):
-    return Learner(
-        networks=make_agent(kind).networks,
-        rewarder=rewarder,
-        learning_rate=3e-3,
-        critic_target_tau=0.01,
-        noise_clip=0.3,
-        shift_padding=shift_padding,
-        pre_tanh_penalty=0.0,
-        exploration_std=optax.constant_schedule(0.1),
-    )
+    return learner_with(make_agent(kind).networks, rewarder, shift_padding)
 
 
 def shape_of(kind):

@@ -17,9 +17,13 @@ def learner_of(make_rewarder, observation, shift_padding, settings):
         feature_dim=16, hidden_dim=32, observation=observation
     )
     agent = AgentSpec(networks, 1, shift_padding)
+    return learner_with(networks, make_rewarder(agent, **settings), shift_padding)
+
+
+def learner_with(networks, rewarder, shift_padding):
     return Learner(
         networks=networks,
-        rewarder=make_rewarder(agent, **settings),
+        rewarder=rewarder,
         learning_rate=3e-3,
         critic_target_tau=0.01,
         noise_clip=0.3,
