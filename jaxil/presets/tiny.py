@@ -52,7 +52,7 @@ _GRADIENT_PENALTIES = {("pdac", "cartpole_swingup"): 1.0}
 _FALLING_RATES = {
     "cartpole_swingup": (300_000, 75_000),
     "finger_spin": (400_000, 125_000),
-    "walker_walk": (600_000, 250_000),
+    "walker_walk": (700_000, 250_000),
 }
 _WALKERS = ("walker_stand", "walker_walk", "walker_run")
 _JUDGED_BY_COMPONENTS = {"pdac": (*_WALKERS, "finger_spin"), "psil": ("finger_spin",)}
