@@ -123,17 +123,15 @@ class Run(Parts):
         return actions
 
     def learn(self, num_steps: int) -> None:
-        """Counts agent steps and starts the updates that they make due.
-
-        jax only starts them here; the next actions wait for their end.
-        """
+        """Counts agent steps and starts the updates due, without waiting for them."""
         for _ in range(num_steps):
             before = self.frame
             self.counters.num_steps += 1
             if self.update_is_due(before):
                 rng = self._rng(_SAMPLED_BATCHES, self.counters.num_steps)
-                if self.updates.collect(rng):
-                    self.flush()
+                for _ in range(self.config.updates_per_step):
+                    if self.updates.collect(rng):
+                        self.flush()
 
     def update_is_due(self, before: int) -> bool:
         """Returns whether an agent step is followed by an update.

@@ -75,6 +75,15 @@ def test_several_environments_take_turns_with_the_learner():
     assert np.all(np.diff([row["seconds"] for row in dummies.rows]) > 0)
 
 
+def test_several_updates_may_follow_a_step():
+    once, thrice = (
+        Dummies(update_every_steps=2, updates_per_step=n).loop().tape for n in (1, 3)
+    )
+    more = [[word] * (3 if word == "update" else 1) for word in once]
+    assert once.count("update") > 1
+    assert thrice == [word for words in more for word in words]
+
+
 @pytest.mark.parametrize(("size", "every"), [(2, 1), (2, 2), (3, 2), (4, 5)])
 def test_updates_and_episodes_are_as_many_as_with_one_environment(size, every):
     changes = {"seed_frames": 0, "update_every_steps": every, "total_frames": 42}

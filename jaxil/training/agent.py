@@ -77,11 +77,20 @@ def exploration_schedule(config: Config) -> optax.Schedule:
     )
 
 
+def exploration_by_update(config: Config) -> optax.Schedule:
+    """Returns the same by update number: updates draw the noise of their time."""
+    schedule = exploration_schedule(config)
+    first = config.seed_frames // config.action_repeat
+    every, at_once = config.update_every_steps, config.updates_per_step
+    return lambda num_updates: schedule(first + num_updates * every // at_once)
+
+
 def learning_rate(config: Config) -> optax.ScalarOrSchedule:
     """Returns the learner's rate, by update number where it changes."""
     if not config.learning_rate_steps:
         return config.learning_rate
-    num_updates = config.learning_rate_steps / config.update_every_steps
+    share = config.updates_per_step / config.update_every_steps
+    num_updates = config.learning_rate_steps * share
     return optax.linear_schedule(
         config.learning_rate, config.learning_rate_end, math.ceil(num_updates)
     )
@@ -188,8 +197,6 @@ def make_agent(
     mean = mean_image(config, demonstrations)
     networks = make_networks(config, action_dim, mean)
     rewarder = make_rewarder(config, networks)
-    schedule = exploration_schedule(config)
-    first_update = config.seed_frames // config.action_repeat
     learner = Learner(
         networks=networks,
         rewarder=rewarder,
@@ -198,9 +205,7 @@ def make_agent(
         noise_clip=config.noise_clip,
         shift_padding=config.shift_padding,
         pre_tanh_penalty=config.pre_tanh_penalty,
-        exploration_std=lambda num_updates: schedule(
-            first_update + num_updates * config.update_every_steps
-        ),
+        exploration_std=exploration_by_update(config),
     )
     observation = np.zeros(
         environment.observation_spec().shape, environment.observation_spec().dtype
@@ -231,7 +236,9 @@ def make_agent(
         # The old state is dead after the call, so XLA may reuse its memory.
         update_step=jax.jit(step, donate_argnums=0),
         repeated_step=jax.jit(make_repeated_step(step), donate_argnums=0),
-        sample_action=jax.jit(make_sample_action(networks, schedule)),
+        sample_action=jax.jit(
+            make_sample_action(networks, exploration_schedule(config))
+        ),
         mean_action=jax.jit(make_mean_action(networks)),
         observe=jax.jit(rewarder.observe),
         rewards=jax.jit(rewarder.rewards),

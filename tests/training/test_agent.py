@@ -11,13 +11,30 @@ def test_the_learning_rate_is_constant_by_default():
     assert agent.learning_rate(jaxil_config.default_config()) == 1e-4
 
 
+@pytest.mark.parametrize("at_once", [1, 3])
 @pytest.mark.parametrize(
     ("num_updates", "expected"), [(0, 4e-4), (25, 3e-4), (100, 0.0), (999, 0.0)]
 )
-def test_its_steps_are_the_agents_and_not_updates(num_updates, expected):
+def test_its_steps_are_the_agents_and_not_updates(num_updates, expected, at_once):
     config = jaxil_config.default_config()
     config.learning_rate, config.learning_rate_end = 4e-4, 0.0
     config.learning_rate_steps, config.update_every_steps = 200, 2
+    config.updates_per_step = at_once
+    num_updates *= at_once
     schedule = agent.learning_rate(config)
     assert callable(schedule)
     np.testing.assert_allclose(schedule(num_updates), expected, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize(("every", "at_once"), [(2, 1), (1, 1), (1, 4)])
+def test_updates_draw_the_noise_of_their_agent_step(every, at_once):
+    config = jaxil_config.default_config()
+    config.seed_frames, config.action_repeat = 40, 2
+    config.exploration_std_start, config.exploration_std_end = 1.0, 0.1
+    config.exploration_std_steps = 100
+    config.update_every_steps, config.updates_per_step = every, at_once
+    by_step = agent.exploration_schedule(config)
+    by_update = agent.exploration_by_update(config)
+    for step in (0, 8, 40, 500):  # after the first update
+        num_updates = step // every * at_once
+        np.testing.assert_allclose(by_update(num_updates), by_step(20 + step))
