@@ -242,6 +242,7 @@ def test_a_run_that_is_stopped_again_and_again_is_that_of_an_unbroken_one(
         "method": "pdac",
         "num_environments": num_environments,
         "update_every_steps": 3,
+        "updates_per_step": 2,
         "reward_refresh_steps": STEPS + 5,
         "eval_every_frames": 2 * STEPS,
     }
