@@ -78,7 +78,7 @@ def exploration_schedule(config: Config) -> optax.Schedule:
 
 
 def exploration_by_update(config: Config) -> optax.Schedule:
-    """Returns the same by update number: updates draw the noise of their time."""
+    """Returns that deviation by update number, for the actions drawn in updates."""
     schedule = exploration_schedule(config)
     first = config.seed_frames // config.action_repeat
     every, at_once = config.update_every_steps, config.updates_per_step
