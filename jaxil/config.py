@@ -76,7 +76,7 @@ FIELDS: dict[str, Field] = {
     "seed_frames": Field(4_000, "before the first update; 4000 in DrQ-v2", 1, 10**9),
     "exploration_steps": Field(2_000, "of uniform actions; 2000 in DrQ-v2", 0, 10**9),
     "update_every_steps": Field(2, "agent steps per update; 2 in the paper", 1, 10**6),
-    "updates_per_step": Field(1, "updates in a row, each time; 1 in the paper", 1, 1_000),
+    "updates_per_step": Field(1, "updates in a row each time; 1 in the paper", 1, 100),
     # DrQ-v2.
     "learning_rate": Field(
         1e-4, "of each network's Adam; 1e-4 in the paper", 0, 1, positive=True
