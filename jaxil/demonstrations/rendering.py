@@ -211,6 +211,9 @@ def _render_together(
         # Killed, because cleanup in GL drivers may hang.
         for process in set(multiprocessing.active_children()) - others:
             process.kill()
+        # One that was sending images leaves half of them in the pipe, and the executor
+        # waits for the rest while anyone might write it: that is us, now.
+        executor._result_queue._writer.close()  # pyright: ignore[reportAttributeAccessIssue]
         executor.shutdown()
 
 
