@@ -2,6 +2,7 @@
 
 import logging
 import multiprocessing
+import multiprocessing.connection
 import os
 import pathlib
 import signal
@@ -21,6 +22,7 @@ from tests.processes import wait_until_gone
 TASK = "finger_turn_hard"  # its target is not part of the simulator's state
 SEED, FIRST, EPISODES, LENGTH, SIZE = 5, 3, 3, 20, 24
 TOTAL = EPISODES * LENGTH
+REAL_RENDER = rendering._render_episode
 
 
 def make_states():
@@ -149,6 +151,43 @@ def test_states_of_another_model_are_refused():
     for processes in (1, None):
         with pytest.raises(ValueError, match="qpos has shape"):
             observe(processes=processes, states=states)
+
+
+def render_and_send_half(settings, gl_name, number, states):
+    """Renders in a process; all but the first episode are never sent whole."""
+    send = multiprocessing.connection.Connection._send  # pyright: ignore
+
+    def send_half(connection, buffer):
+        send(connection, buffer[: len(buffer) // 2])
+        pathlib.Path(os.environ["HALF_SENT"]).touch()
+        time.sleep(1000)
+
+    if number > FIRST:
+        multiprocessing.connection.Connection._send = send_half  # pyright: ignore
+    return REAL_RENDER(settings, gl_name, number, states)
+
+
+def test_half_sent_images_are_not_waited_for(alone, tmp_path, monkeypatch):
+    monkeypatch.setattr(rendering, "_render_episode", render_and_send_half)
+    half_sent, stopped = tmp_path / "half_sent", []
+    monkeypatch.setenv("HALF_SENT", str(half_sent))
+
+    def stop(*_):
+        while not half_sent.exists():
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+
+    def observe_until_stopped():
+        try:
+            observe(stop, processes=2)
+        except KeyboardInterrupt:
+            stopped.append(True)
+
+    thread = threading.Thread(target=observe_until_stopped, daemon=True)
+    thread.start()
+    thread.join(60)
+    assert stopped
+    assert not children()
 
 
 _SCRIPT = """
