@@ -153,28 +153,35 @@ def test_states_of_another_model_are_refused():
             observe(processes=processes, states=states)
 
 
+def wait_for(path):
+    while not path.exists():
+        time.sleep(0.01)
+
+
 def render_and_send_half(settings, gl_name, number, states):
     """Renders in a process; all but the first episode are never sent whole."""
     send = multiprocessing.connection.Connection._send  # pyright: ignore
 
     def send_half(connection, buffer):
         send(connection, buffer[: len(buffer) // 2])
-        pathlib.Path(os.environ["HALF_SENT"]).touch()
+        (folder / "half_sent").touch()
         time.sleep(1000)
 
+    folder = pathlib.Path(os.environ["MARKS"])
     if number > FIRST:
+        wait_for(folder / "first_received")  # which half an image would hold up
         multiprocessing.connection.Connection._send = send_half  # pyright: ignore
     return REAL_RENDER(settings, gl_name, number, states)
 
 
 def test_half_sent_images_are_not_waited_for(alone, tmp_path, monkeypatch):
     monkeypatch.setattr(rendering, "_render_episode", render_and_send_half)
-    half_sent, stopped = tmp_path / "half_sent", []
-    monkeypatch.setenv("HALF_SENT", str(half_sent))
+    monkeypatch.setenv("MARKS", str(tmp_path))
+    stopped = []
 
     def stop(*_):
-        while not half_sent.exists():
-            time.sleep(0.01)
+        (tmp_path / "first_received").touch()
+        wait_for(tmp_path / "half_sent")
         raise KeyboardInterrupt
 
     def observe_until_stopped():
