@@ -32,8 +32,14 @@ from jaxil.files.untrusted import require_regular
 # The first that recognises a file reads it. Datasets may contain videos, and folders
 # of videos pictures.
 _READERS: tuple[Any, ...] = (
-    *(own, pickles, minari, lerobot, replays, hdf5),
-    *(videos, pictures),
+    own,
+    pickles,
+    minari,
+    lerobot,
+    replays,
+    hdf5,
+    videos,
+    pictures,
 )
 # Safe without a child process: parsed in Python, and checked before unpacking.
 _IN_PROCESS = (own, replays)
@@ -104,15 +110,15 @@ def open_recording(
         items = read_in_child(reader.read, path, options)
     recording = next(items)
     repeat = recording.action_repeat or action_repeat or None
-    recording = recording._replace(action_repeat=repeat)
     speed = recording.frames_per_second
-    if reader is videos:  # it has skipped frames already
-        frame_skip = 1
+    if reader is videos:  # it skips frames itself, and its frame rate says so
+        repeat, frame_skip = repeat and repeat * frame_skip, 1
+    recording = recording._replace(action_repeat=repeat)
     stride: float = frame_skip
     if frames_per_step is not None:
         stride = frames_per_step(recording)
     return recording._replace(
-        episodes=_fitted(items, stride, None if keep_aspect else image_size, fit),
+        episodes=_fitted(items, stride, options),
         task=recording.task and printable(recording.task),
         action_repeat=repeat and round(repeat * stride),
         frames_per_second=speed and speed / stride,
@@ -131,9 +137,9 @@ def read_episodes(
 ) -> PixelEpisodes:
     """Reads the first episodes, resized with antialiasing.
 
-    `max_bytes` limits the result and every intermediate array; `takes_fewer` contents
-    itself with the episodes that there are; for the other arguments see
-    `open_recording`.
+    `max_bytes` limits the frames of the result and every intermediate array;
+    `takes_fewer` accepts fewer episodes than `num_episodes`; for the other arguments
+    see `open_recording`.
 
     Raises:
       FormatError: see `open_recording`; or too few episodes, or too many bytes.
@@ -146,11 +152,11 @@ def read_episodes(
             f"holds {recording.num_episodes} episodes, but num_episodes={num_episodes};"
             f" set demonstrations.num_episodes={recording.num_episodes}"
         )
-    episodes, num_bytes = [], 0
+    episodes, longest_bytes = [], 0
     for episode in itertools.islice(recording.episodes, num_episodes):
         episodes.append(episode)
-        num_bytes += episode.frames.nbytes
-        if num_bytes > max_bytes:
+        longest_bytes = max(longest_bytes, episode.frames.nbytes)
+        if len(episodes) * longest_bytes > max_bytes:  # all are padded to the longest
             raise FormatError(
                 f"needs more than {max_bytes} bytes for {len(episodes)} episodes at "
                 f"{image_size}x{image_size} pixels"
@@ -168,12 +174,10 @@ def read_episodes(
 
 
 def _fitted(
-    items: Iterator[PixelEpisode | None],
-    stride: float,
-    image_size: int | None,
-    fit: str,
+    items: Iterator[PixelEpisode | None], stride: float, options: ReadOptions
 ) -> Iterator[PixelEpisode]:
-    """Takes a frame every `stride` of them and resizes it."""
+    """Yields episodes of every `stride`-th frame, resized; below 1, frames repeat."""
+    image_size = None if options.keep_aspect else options.image_size
     for index, episode in enumerate(item for item in items if item is not None):
         frames, actions, rewards, stored_size = episode
         num_steps = int((len(frames) - 1) / stride + 1e-6)
@@ -181,18 +185,24 @@ def _fitted(
             what = f"has {len(frames)} frames in episode {index}"
             skip = f"frame_skip={stride}" if isinstance(stride, int) else "one step"
             raise FormatError(f"{what}, too few for {skip}")
+        if stride < 1 and frames.nbytes > options.max_bytes * stride:
+            raise FormatError(
+                f"has so few frames per step in episode {index}, {stride:.3g}, that "
+                f"repeating them takes more than the {options.max_bytes} bytes allowed"
+            )
         if stride != 1:
             times = np.rint(np.arange(num_steps + 1) * stride).astype(int)
             frames = frames[times]
             if actions is not None:
-                actions = actions[times[:-1]]
+                # The last step may be nearest to the last frame, which has no action.
+                actions = actions[np.minimum(times[:-1], len(actions) - 1)]
             if rewards is not None:
                 sums = np.append(0.0, np.cumsum(rewards, dtype=np.float64))
                 rewards = np.diff(sums[times]).astype(np.float32)
         height, width = stored_size or frames.shape[1:3]
         if image_size is not None and frames.shape[1:3] != (image_size, image_size):
             size = (image_size, image_size)
-            frames = np.stack([resized(x, size, fit) for x in frames])
+            frames = np.stack([resized(x, size, options.fit) for x in frames])
         yield PixelEpisode(frames, actions, rewards, (height, width))
 
 

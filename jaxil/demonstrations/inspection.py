@@ -1,6 +1,5 @@
 """Summarises a demonstration file as a table, a contact sheet and a video."""
 
-import itertools
 import pathlib
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -221,9 +220,8 @@ def contact_sheet(inspection: Inspection) -> Image.Image:
         if summary.task_return is not None:
             caption += f", return {summary.task_return:.0f}"
         draw.text((_MARGIN, top), caption, fill=(235, 235, 235))
-        for left, (time, frame) in zip(
-            itertools.count(_MARGIN, column_width), pictures
-        ):
+        for column, (time, frame) in enumerate(pictures):
+            left = _MARGIN + column * column_width
             image = Image.fromarray(frame).resize(cell, Image.Resampling.BILINEAR)
             sheet.paste(image, (left, top + _CAPTION))
             corner = (left + 3, top + _CAPTION + 1)
@@ -232,15 +230,15 @@ def contact_sheet(inspection: Inspection) -> Image.Image:
 
 
 def most_different(points: np.ndarray) -> np.ndarray:
-    """Returns the indices of points that differ most, in their order.
+    """Returns the indices of the points that differ most, in ascending order.
 
-    The first one, then whichever is farthest from all that were chosen before.
+    They are chosen by farthest-point sampling, which starts with the first point.
 
     Args:
       points: shape [N, D], N >= 1.
 
     Returns:
-      At most 8 indices; fewer where all others equal one of them.
+      At most 8 indices; fewer if every other point equals a chosen one.
     """
     chosen = [0]
     distances = np.full(len(points), np.inf)
@@ -266,7 +264,7 @@ def _fps(stored: states.StateDemonstrations) -> float:
 
 
 def _read_states(path: pathlib.Path) -> states.StateDemonstrations:
-    """Reads states that are to be rendered, by a task of the user's own if need be."""
+    """Reads states to render; their task must be trusted if it names code."""
     stored = states.read_states(path)
     if tasks.names_code(stored.metadata["task"]):
         outside.require_trusted(stored.metadata["task"], "task", path)

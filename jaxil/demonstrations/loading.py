@@ -29,8 +29,8 @@ class Demonstrations(NamedTuple):
       num_frames: without padding. Shape [K].
       actions: float32 [K, N, A]; None if unknown.
       task_rewards: float32 [K, N]; None if unknown. Only for logs.
-      metadata: the file's, with `file`, the agent's `action_repeat`, and `returns` at
-        that action repeat: one per episode, or an empty list if unknown.
+      metadata: the file's, and for the steps above `file`, the path; `action_repeat`,
+        None if unknown; and `returns`, one per episode, or an empty list if unknown.
     """
 
     frames: np.ndarray
@@ -253,7 +253,7 @@ def _load_pixels(path: pathlib.Path, request: Wanted) -> Demonstrations:
     return _read_pixels(path, stamps, request)
 
 
-# `check` and `load` share one reading. The run keeps these pixels in memory anyway.
+# `check` and `load` share one read. The run keeps these pixels in memory anyway.
 @functools.lru_cache(maxsize=1)
 def _read_pixels(
     path: pathlib.Path, stamps: tuple[tuple[str, int], ...], request: Wanted
@@ -278,7 +278,7 @@ def _read_pixels(
         seconds, _ = tasks.timing(task, action_repeat)
         if not recording.frames_per_second or not seconds:
             raise FormatError(
-                "tells no frame rate, so it cannot be sampled by time; state "
+                "has no frame rate, so it cannot be sampled by time; set "
                 "demonstrations.action_repeat"
             )
         return recording.frames_per_second * seconds

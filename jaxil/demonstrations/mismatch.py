@@ -10,7 +10,7 @@ from jaxil.environments import suite, tasks
 from jaxil.errors import printable
 
 _RATE_TOLERANCE = 0.1  # relative, of a video's frame rate
-_LARGEST_ACTION = 1.001  # beyond rounding
+_LARGEST_ACTION = 1.001  # 1, with room for rounding
 _MAX_SHOWN = 10
 _FITS = {
     "stretch": "squeezed into a square",

@@ -13,10 +13,7 @@ Finished = Callable[[int, float], None]  # episode number, return
 
 
 def play(
-    environment: Any,
-    begin: Begin,
-    num_episodes: int,
-    finished: Finished = lambda episode, task_return: None,
+    environment: Any, begin: Begin, num_episodes: int, finished: Finished
 ) -> dict[str, np.ndarray]:
     """Plays episodes 0 ... K - 1; returns the arrays of `StateDemonstrations`.
 
@@ -49,7 +46,7 @@ def _played(
     finished: Finished,
     look: Callable[[], Any],
 ) -> Iterator[tuple[list[Any], np.ndarray, np.ndarray]]:
-    """Yields what each episode looks like [N + 1], its actions and its rewards [N]."""
+    """Yields `look()` at the N + 1 times of an episode, actions [N, A], rewards [N]."""
     for episode in range(num_episodes):
         timestep = environment.reset(episode=episode)
         decide = begin(episode)

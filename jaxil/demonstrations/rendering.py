@@ -24,8 +24,8 @@ from jaxil.machine.cache import cache_folder
 
 # Part of each key; increment it when images change for a reason not in the key.
 _CACHE_VERSION = 2
-_MAX_PROCESSES = 8  # of about 250 MB
-# Seconds of software rendering; fewer pixels are done before a process has started.
+_MAX_PROCESSES = 8  # each takes about 250 MB
+# Takes seconds in software. Fewer pixels are rendered before a process has started.
 _MIN_PARALLEL_PIXELS = 2_000_000
 _TIMEOUT_SECONDS = 1800.0  # for the next episode of any process
 _SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer")
@@ -57,8 +57,8 @@ def observe_episodes(
     Args:
       states: `qpos`, `qvel` and `act`, each of shape [K, N + 1, n].
       seed: of the recording environment.
-      first_episode: number of the first episode there. With the seed it restores what
-        is not in the states: targets, terrain.
+      first_episode: number of the first episode in that environment. With the seed it
+        restores what is not in the states: targets, terrain.
       cache: whether to read and write images in `cache_folder()`.
       progress: called with (images done, all images) while rendering.
       processes: None chooses the number. The images do not depend on it.
@@ -67,7 +67,8 @@ def observe_episodes(
       Images, uint8 [K, N + 1, H, W, 3], or states, float32 [K, N + 1, S].
 
     Raises:
-      ValueError: the states do not fit the task's model, or see `make_environment`.
+      ValueError: the task has no simulator states, or these do not fit its model; or
+        see `make_environment`.
       RuntimeError: rendering is not available.
     """
     settings = {
@@ -81,7 +82,8 @@ def observe_episodes(
         "distraction": distraction,
     }
     with tasks.make_environment(**settings) as environment:
-        assert isinstance(environment, suite.SuiteEnvironment)
+        if not isinstance(environment, suite.SuiteEnvironment):
+            raise ValueError(f"holds simulator states, which {task} cannot take")
         spec = environment.observation_spec()
         num_episodes, length = states["qpos"].shape[:2]
         observed = np.empty((num_episodes, length, *spec.shape), spec.dtype)
@@ -152,7 +154,7 @@ def observe_episodes(
 
 
 def num_processes(num_pixels: int, gl_name: str) -> int:
-    """Returns the fastest number of processes for all images together."""
+    """Returns how many processes render so many pixels in the shortest time."""
     # One process is fast enough on a GPU, where parallel EGL contexts may hang.
     is_software = any(name in gl_name.lower() for name in _SOFTWARE)
     if not is_software or num_pixels < _MIN_PARALLEL_PIXELS:
@@ -211,8 +213,8 @@ def _render_together(
         # Killed, because cleanup in GL drivers may hang.
         for process in set(multiprocessing.active_children()) - others:
             process.kill()
-        # One that was sending images leaves half of them in the pipe, and the executor
-        # waits for the rest while anyone might write it: that is us, now.
+        # A process killed while it sends images leaves half of them in the pipe. The
+        # executor waits for the rest until the last writing end is closed: this one.
         executor._result_queue._writer.close()  # pyright: ignore[reportAttributeAccessIssue]
         executor.shutdown()
 

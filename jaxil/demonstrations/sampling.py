@@ -21,8 +21,8 @@ def sample(
     Args:
       frame_stack: frames in an observation; the first is repeated at the start.
       successors: whether to add the next observations.
-      as_indices: whether observations are the int32 [B, frame_stack] indices of their
-        frames, oldest first, in all episodes end to end, [K * (N + 1), ...].
+      as_indices: whether to return observations as indices, int32 [B, frame_stack],
+        oldest first, into the frames of all episodes end to end, [K * (N + 1), ...].
 
     Returns:
       Observations uint8 [B, H, W, 3 * frame_stack] or float32 [B, S], and actions

@@ -67,9 +67,9 @@ class StateDemonstrations(NamedTuple):
     def simulator_states(
         self, times: np.ndarray | slice, episodes: slice = slice(None)
     ) -> dict[str, np.ndarray]:
-        """Returns `qpos`, `qvel` and `act` of given episodes and times."""
-        named = {name: getattr(self, name) for name in ("qpos", "qvel", "act")}
-        return {name: array[episodes, times] for name, array in named.items()}
+        """Returns `qpos`, `qvel` and `act` of the given episodes and times."""
+        names = ("qpos", "qvel", "act")
+        return {name: getattr(self, name)[episodes, times] for name in names}
 
 
 def new_metadata(
@@ -176,7 +176,7 @@ def read_states(
       path: the file.
       task: the required task; None for any.
       num_episodes: returns the first ones; None for all.
-      takes_fewer: whether all will do, if there are fewer.
+      takes_fewer: whether fewer episodes than `num_episodes` will do.
 
     Raises:
       DemonstrationError: the file cannot be read, is damaged, or does not fit.
@@ -243,8 +243,8 @@ def _metadata_fault(metadata: Any) -> str | None:
         if not isinstance(value, kind) or isinstance(value, bool):
             return f"has metadata {name}={value!r}, but {kind.__name__} is expected"
     for name, least in (("action_repeat", 1), ("seed", 0), ("first_episode", 0)):
-        if metadata[name] < least:
-            return f"has metadata {name}={metadata[name]}, which is below {least}"
+        if not least <= metadata[name] < 2**63:
+            return f"has metadata {name}={metadata[name]}, not in [{least}, 2**63)"
     return None
 
 

@@ -21,17 +21,17 @@ from tests.demonstrations.videos import encode_video
 
 
 def write_lerobot(path: pathlib.Path, seed: int) -> None:
-    """A dataset's folder like LeRobot's of version 3, its video without loss."""
+    """A LeRobot dataset of version 3, with a lossless video."""
     make_lerobot_dataset(path, [lerobot_episode(3, seed), lerobot_episode(5, seed + 1)])
 
 
 def write_minari(path: pathlib.Path, seed: int) -> None:
-    """A dataset's folder as Minari writes it; too small for its JPEGs."""
+    """A Minari dataset, whose frames are too small for it to store as JPEGs."""
     make_minari_dataset(path, [minari_episode(3, seed), minari_episode(4, seed + 1)])
 
 
 def write_video(path: pathlib.Path, seed: int) -> None:
-    """An MP4 file of one episode, whose every pixel is kept."""
+    """A lossless MP4 file of one episode."""
     frames = _random_frames(np.random.default_rng(seed), num_frames=5)
     encode_video(path, frames, format="mp4")
 
@@ -55,7 +55,7 @@ def _random_frames(rng: np.random.Generator, num_frames: int, size=8) -> np.ndar
 
 
 def write_pickle(path: pathlib.Path, seed: int) -> None:
-    """Two episodes as ROT writes them, in one of the forms and protocols by turns."""
+    """Two episodes as ROT writes them; the seed also picks form and protocol."""
     rng = np.random.default_rng(seed)
     protocol, form = 2 + seed % 4, PICKLE_FORMS[seed // 4 % len(PICKLE_FORMS)]
     lengths = (4, 4) if form == "arrays" else (3, 5)
@@ -143,9 +143,9 @@ def pickle_content(episodes, form: str) -> list:
 
 
 def python2_pickle(array: np.ndarray) -> bytes:
-    """Returns the instructions by which Python 2 pickled an array of uint8 [K, T, ...].
+    """Returns the opcodes with which Python 2 pickled a uint8 array [K, T, ...].
 
-    As its `cPickle` and `pickletools.dis` show them; strings there are bytes.
+    Worked out from its `cPickle` and `pickletools.dis`; its strings are bytes.
     """
     data = array.tobytes()
     return b"".join(

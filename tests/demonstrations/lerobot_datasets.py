@@ -1,4 +1,4 @@
-"""LeRobot datasets of known content, as its documentation describes version 3."""
+"""LeRobot datasets of known content, written as it documents version 3."""
 
 import io
 import json
@@ -62,7 +62,7 @@ def make_lerobot_dataset(
                 f"videos/{CAMERA}/from_timestamp": start / 10,
             }
         )
-    make_parquet(path / "meta/episodes/chunk-000/file-000.parquet", rows)
+    make_parquet(path / INDEX_FILE, rows)
     for file in range(-(-len(episodes) // per_file)):
         chosen = range(len(episodes))[file * per_file :][:per_file]
         _write_lerobot_file(path, file, episodes, chosen, as_images, gap)

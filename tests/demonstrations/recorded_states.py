@@ -1,4 +1,4 @@
-"""A recording of random actions, as states and as the frames that were seen."""
+"""A recording of random actions: the states to store, and the frames seen."""
 
 import pathlib
 
@@ -17,20 +17,14 @@ VIEW = {"image_size": SIZE, "render_quality": "fast"}
 def play(environment, episode: int, actions: np.ndarray):
     """Plays; returns states and frames, one more than actions, and the rewards."""
     environment.reset(episode=episode)
-    visited, frames, rewards = (
-        [environment.simulator_state()],
-        [environment.frame()],
-        [],
-    )
+    visited, frames = [environment.simulator_state()], [environment.frame()]
+    rewards = []
     for action in actions:
         rewards.append(environment.step(action).reward)
         visited.append(environment.simulator_state())
         frames.append(environment.frame())
-    moments = {
-        name: np.stack([state[name] for state in visited])
-        for name in ("qpos", "qvel", "act")
-    }
-    return moments, np.stack(frames), np.array(rewards, np.float32)
+    arrays = {name: np.stack([each[name] for each in visited]) for name in visited[0]}
+    return arrays, np.stack(frames), np.array(rewards, np.float32)
 
 
 def record():
@@ -43,8 +37,8 @@ def record():
         for index, chosen in enumerate(actions)
     ]
     environment.close()
-    moments = [each[0] for each in played]
-    arrays = {name: np.stack([each[name] for each in moments]) for name in moments[0]}
+    visited = [each[0] for each in played]
+    arrays = {name: np.stack([each[name] for each in visited]) for name in visited[0]}
     frames = np.stack([each[1] for each in played])
     rewards = np.stack([each[2] for each in played])
     metadata = states.new_metadata(

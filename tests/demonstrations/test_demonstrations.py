@@ -113,24 +113,24 @@ def test_samples_are_stacks_of_one_episode_with_their_actions(batch_size, frame_
 # --- cache ----------------------------------------------------------------------------
 
 
-def drawn_images(path, **changes) -> int:
-    drawn = []
-    load(path, progress=lambda done, total: drawn.append((done, total)), **changes)
-    return len(drawn)
+def num_rendered(path, **changes) -> int:
+    calls = []
+    load(path, progress=lambda *call: calls.append(call), **changes)
+    return len(calls)
 
 
-def test_images_are_drawn_once_for_each_view(path, monkeypatch):
+def test_images_are_rendered_once_for_each_view(path, monkeypatch):
     whole = NUM_EPISODES * (NUM_STEPS + 1)
-    assert drawn_images(path, num_episodes=1) == whole / 2
-    assert drawn_images(path) == whole / 2, "the first episode was there already"
-    assert drawn_images(path) == 0
-    assert drawn_images(path, image_size=SIZE + 1) == whole
-    assert drawn_images(path, render_quality="paper") == whole
-    assert drawn_images(path, action_repeat=4) == NUM_EPISODES * 3
-    assert drawn_images(path, cache=False) == whole
+    assert num_rendered(path, num_episodes=1) == whole / 2
+    assert num_rendered(path) == whole / 2, "the first episode was there already"
+    assert num_rendered(path) == 0
+    assert num_rendered(path, image_size=SIZE + 1) == whole
+    assert num_rendered(path, render_quality="paper") == whole
+    assert num_rendered(path, action_repeat=4) == NUM_EPISODES * 3
+    assert num_rendered(path, cache=False) == whole
     versions = {"mujoco": "0", "dm_control": "0"}
     monkeypatch.setattr(rendering.suite, "simulator_versions", lambda: versions)
-    assert drawn_images(path) == whole, "another simulator draws other pixels"
+    assert num_rendered(path) == whole, "another simulator renders other pixels"
     np.testing.assert_array_equal(load(path).frames, FRAMES)
 
 
@@ -162,7 +162,7 @@ def test_damaged_cache_entries_are_rendered_again(path, tmp_path, damage):
     entry = min((tmp_path / "cache" / "frames").glob("*.npz"))
     damage(entry)
     np.testing.assert_array_equal(load(path).frames, FRAMES)
-    assert drawn_images(path) == 0
+    assert num_rendered(path) == 0
     assert not list(entry.parent.glob("*.part"))
 
 
@@ -173,7 +173,7 @@ def test_a_cache_that_cannot_be_written_is_done_without(path, monkeypatch, caplo
     assert "JAXIL_CACHE" in caplog.text
 
 
-def test_other_versions_are_said(path, caplog):
+def test_other_versions_are_warned_of(path, caplog):
     old = {"mujoco": "3.0.0", "dm_control": "1.0.14", "jaxil": "0.1.0"}
     states.write_states(
         path, RECORDED._replace(metadata={**RECORDED.metadata, "versions": old})
@@ -236,14 +236,14 @@ def test_shipped_actions_played_again_lead_to_the_stored_states(task):
     visited, frames, rewards = play(environment, number, actions)
     environment.close()
     np.testing.assert_allclose(rewards, stored.rewards[episode, :num_steps], atol=1e-4)
-    moments = {
+    stored_states = {
         name: getattr(stored, name)[episode : episode + 1, : num_steps + 1]
         for name in visited
     }
-    for name, values in moments.items():
+    for name, values in stored_states.items():
         np.testing.assert_allclose(visited[name], values[0], atol=1e-4, rtol=1e-4)
-    drawn = rendering.observe_episodes(
-        moments, task=task, seed=seed, first_episode=number, cache=False, **VIEW
+    rendered = rendering.observe_episodes(
+        stored_states, task=task, seed=seed, first_episode=number, cache=False, **VIEW
     )
-    assert (drawn[0] != frames).mean() < 1e-3
-    assert drawn.std() > 1.0
+    assert (rendered[0] != frames).mean() < 1e-3
+    assert rendered.std() > 1.0

@@ -104,6 +104,7 @@ TAMPERINGS = {
     "no task": (lambda a: set_metadata(a, task=None), "task=None, but str"),
     "boolean": (lambda a: set_metadata(a, seed=True), "seed=True, but int"),
     "negative": (lambda a: set_metadata(a, first_episode=-1), "first_episode=-1"),
+    "beyond numbers": (lambda a: set_metadata(a, action_repeat=10**400), "not in"),
     "few returns": (lambda a: set_metadata(a, returns=[1.0]), "but 2 are expected"),
     "no return": (lambda a: set_metadata(a, returns=[1.0, None]), "but 2 are expected"),
 }

@@ -1,4 +1,4 @@
-"""Foreign files as the agent gets them: size, frame skip, lengths, and what is said."""
+"""Foreign files as the agent gets them: size, frame skip, lengths, and warnings."""
 
 import contextlib
 import logging
@@ -80,7 +80,24 @@ def test_frame_skip_keeps_every_nth_frame_and_all_rewards(path):
         load(path, frame_skip=6)
 
 
-def test_the_first_episodes_are_taken_and_unlike_lengths_filled_up(path):
+def test_sampling_by_time_repeats_frames_of_longer_steps(path):
+    episode = make_episode(3)
+    write(path, [episode], action_repeat=4)
+    loaded = load(path, num_episodes=1, sampling="time")
+    # Agent steps at 0, 0.5, ... 3 of the file's; ties go to the even one.
+    nearest = [0, 0, 1, 2, 2, 2, 3]
+    np.testing.assert_array_equal(loaded.frames[0], episode.frames[nearest])
+    actions = known(episode.actions)[[0, 0, 1, 2, 2, 2]]
+    np.testing.assert_array_equal(known(loaded.actions)[0], actions)
+    np.testing.assert_allclose(
+        loaded.metadata["returns"], [known(episode.rewards).sum()], rtol=1e-6
+    )
+    needed = 2 * episode.frames.nbytes
+    with pytest.raises(DemonstrationError, match=f"than the {needed - 1} bytes"):
+        load(path, num_episodes=1, sampling="time", max_bytes=needed - 1)
+
+
+def test_the_first_episodes_are_taken_and_padded_with_their_last_frames(path):
     episodes = [make_episode(n, seed=n) for n in (3, 6, 4)]
     write(path, episodes)
     loaded = load(path, num_episodes=3)
@@ -94,8 +111,8 @@ def test_the_first_episodes_are_taken_and_unlike_lengths_filled_up(path):
     np.testing.assert_array_equal(one.frames, episodes[0].frames[None])
 
 
-def test_samples_come_from_every_own_frame_and_no_filling(path):
-    # The value of a frame is its episode and time; fillings would repeat the last one.
+def test_samples_come_from_every_frame_and_no_padding(path):
+    # The value of a frame is its episode and time; padding would repeat the last one.
     episodes = []
     for index, num_steps in enumerate((2, 5)):
         times = np.arange(num_steps + 1, dtype=np.uint8) + 10 * index
@@ -129,10 +146,10 @@ def test_what_only_some_episodes_have_is_left_out(path):
     assert actions.shape == (4, 0)
 
 
-# --- what is said ---------------------------------------------------------------------
+# --- warnings and refusals ------------------------------------------------------------
 
 
-def test_a_file_that_matches_is_warned_of_once(path, caplog):
+def test_a_file_that_matches_is_warned_of_its_renderer_alone(path, caplog):
     write(path, [make_episode(), make_episode()], frames_per_second=50.0)
     with caplog.at_level(logging.WARNING):
         load(path)
@@ -142,7 +159,7 @@ def test_a_file_that_matches_is_warned_of_once(path, caplog):
     assert "action_repeat" not in caplog.text
 
 
-def test_what_cannot_match_is_said(path, caplog):
+def test_mismatches_are_warned_of(path, caplog):
     episode = make_episode()._replace(frames=np.zeros((7, 6, 12, 3), np.uint8))
     write(path, [episode, episode], action_repeat=4, frames_per_second=25.0)
     with caplog.at_level(logging.WARNING):
@@ -170,6 +187,15 @@ def test_a_file_that_cannot_serve(path, changes, message):
         with pytest.raises(DemonstrationError, match=message) as caught:
             call(path, **changes)
         assert str(path) in str(caught.value)
+
+
+def test_padding_counts_towards_the_limit(path):
+    episodes = [make_episode(9), make_episode(1), make_episode(1)]
+    write(path, episodes)
+    padded = 3 * episodes[0].frames.nbytes
+    assert load(path, num_episodes=3, max_bytes=padded).frames.nbytes == padded
+    with pytest.raises(DemonstrationError, match="bytes for 3 episodes"):
+        load(path, num_episodes=3, max_bytes=padded - 1)
 
 
 def test_actions_are_needed_only_where_they_are_seen(path):

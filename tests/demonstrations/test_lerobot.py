@@ -1,4 +1,4 @@
-"""LeRobot datasets: one of its own, and others of known content."""
+"""LeRobot datasets: one that it wrote itself, and others of known content."""
 
 import functools
 import json
@@ -125,8 +125,10 @@ def test_more_than_the_limit_is_refused_and_the_limit_itself_is_not(
     enough = 2 * limit if as_images else limit
     assert_same(read(path, max_bytes=enough)[1], EPISODES)
     limit -= 1
-    with pytest.raises(FormatError, match=f"bytes.*, more than the {limit} "):
+    too_many = f"bytes.*, more than the {limit} "
+    with pytest.raises(FormatError, match=too_many) as caught:
         read(path, max_bytes=limit)
+    assert "frame_skip" not in str(caught.value)  # frames are skipped after that
 
 
 def test_frames_of_videos_are_scaled_while_they_are_decoded(path):

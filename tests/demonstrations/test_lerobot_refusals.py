@@ -132,6 +132,7 @@ INFO_FAULTS = {
     "old": ({"codebase_version": "v2.1"}, "codebase_version 'v2.1', not v3"),
     "no version": ({"codebase_version": 3}, "codebase_version 3"),
     "no rate": ({"fps": 0}, "has fps=0"),
+    "hardly any rate": ({"fps": 5e-324}, "has fps=5e-324"),
     "endless rate": ({"fps": float("inf")}, "has fps=inf"),
     "rate beyond numbers": ({"fps": 10**400}, "has fps=1000"),
     "rate in words": ({"fps": "10"}, "has fps='10'"),

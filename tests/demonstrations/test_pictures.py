@@ -1,35 +1,27 @@
-"""Folders of pictures, NumPy images, and what is done with unlike shapes and rates."""
+"""Folders of pictures, NumPy images, other shapes and rates, useless episodes."""
 
+import functools
 import logging
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from jaxil.demonstrations import loading
 from jaxil.demonstrations.readers import pictures
 from jaxil.demonstrations.readers.frames import resized
 from jaxil.demonstrations.readers.recording import FormatError
 from jaxil.demonstrations.states import DemonstrationError
 from jaxil.environments import tasks
-from tests.demonstrations import foreign_files
+from tests.demonstrations import foreign_files, pixel_files
 from tests.demonstrations.foreign_files import read_here
+from tests.demonstrations.pixel_files import TASK
 from tests.demonstrations.videos import encode_video
 
-TASK = "cartpole_swingup"  # 100 frames a second
 FRAMES = np.random.default_rng(0).integers(0, 256, (12, 8, 8, 3), dtype=np.uint8)
 GRAY = FRAMES[..., 0]
 
 
-def load(path, **changes):
-    settings = {
-        "task": TASK,
-        "num_episodes": 1,
-        "action_repeat": 2,
-        "image_size": 8,
-        "render_quality": "fast",
-    }
-    return loading.load(path, **(settings | changes))
+load = functools.partial(pixel_files.load, num_episodes=1)
 
 
 @pytest.mark.parametrize(
@@ -109,6 +101,19 @@ def test_what_has_no_rate_is_sampled_by_its_stated_action_repeat(tmp_path):
         load(path, sampling="time")
     loaded = load(path, sampling="time", stated_action_repeat=1)
     np.testing.assert_array_equal(loaded.frames[0], FRAMES[:11:2])
+
+
+@pytest.mark.parametrize("name", ["images.npy", "video.mp4"])
+def test_skipped_frames_count_in_a_stated_action_repeat(name, tmp_path, caplog):
+    path = tmp_path / name
+    if name == "images.npy":
+        np.save(path, FRAMES)
+    else:
+        encode_video(path, FRAMES, fps=100)
+    with caplog.at_level(logging.WARNING):
+        loaded = load(path, frame_skip=2, stated_action_repeat=1)
+    assert loaded.metadata["action_repeat"] == 2
+    assert "action_repeat" not in caplog.text
 
 
 def test_a_default_number_of_episodes_takes_what_there_is(tmp_path, caplog):

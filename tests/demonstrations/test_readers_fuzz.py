@@ -1,4 +1,4 @@
-"""Damaged files of every foreign format: each is read, or refused with a sentence.
+"""Damaged files of every foreign format: each is read, or refused with one line.
 
 A child process does the reading, so that a crash, a hang or an allocation without
 bounds is a failed test. `JAXIL_FUZZ_MUTANTS=1000` reads that many files of each format.
@@ -30,7 +30,7 @@ LIMITS: dict = {
 
 
 class Format(NamedTuple):
-    """A format to try; sound files are written by seeds 0, 1, ..., `num_variants`."""
+    """A format to try; seeds below `num_variants` write different valid files."""
 
     write: str
     num_variants: int
@@ -69,15 +69,15 @@ def test_damaged_files_are_read_or_refused(name, tmp_path):
 def read_mutants(
     name: str, folder: pathlib.Path, num_files: int, first_seed: int = 1
 ) -> Iterator[str]:
-    """Yields what became of each file; the first is sound, the others are mutants."""
+    """Yields what became of each file; the first is valid, the others are mutants."""
     form = FORMATS[name]
     for variant in range(form.num_variants):
-        (folder / f"sound{variant}").mkdir()
+        (folder / f"valid{variant}").mkdir()
         write = getattr(foreign_files, form.write)
-        write(folder / f"sound{variant}" / "data", variant)
+        write(folder / f"valid{variant}" / "data", variant)
     for seed in (0, *range(first_seed, first_seed + num_files - 1)):
         shutil.rmtree(folder / "mutant", ignore_errors=True)
-        shutil.copytree(folder / f"sound{seed % form.num_variants}", folder / "mutant")
+        shutil.copytree(folder / f"valid{seed % form.num_variants}", folder / "mutant")
         if seed > 0:
             parts = sorted((folder / "mutant").rglob("*"))
             files = [part for part in parts if part.is_file()]
@@ -97,9 +97,10 @@ def read_mutants(
 
 
 def mutated_file(content: bytes, seed: int) -> bytes:
-    """Returns a mutant of a file's content; half of the time, of what an archive holds.
+    """Returns a mutant of a file's content.
 
-    An archive's checksums would hide all damage within from those who read on.
+    Of an archive, half the time, one member is changed and all are packed again:
+    otherwise its checksums would keep readers from ever seeing the damage.
     """
     rng = np.random.default_rng([seed, 1])
     if rng.random() < 0.5 or not zipfile.is_zipfile(io.BytesIO(content)):

@@ -1,5 +1,6 @@
 """Rendering by several processes: the same images and files, whatever happens."""
 
+import contextlib
 import logging
 import multiprocessing
 import multiprocessing.connection
@@ -151,6 +152,15 @@ def test_states_of_another_model_are_refused():
     for processes in (1, None):
         with pytest.raises(ValueError, match="qpos has shape"):
             observe(processes=processes, states=states)
+
+
+def test_a_task_without_simulator_states_is_refused(monkeypatch):
+    def make_environment(**_):
+        return contextlib.nullcontext()
+
+    monkeypatch.setattr(rendering.tasks, "make_environment", make_environment)
+    with pytest.raises(ValueError, match=f"states, which {TASK} cannot take"):
+        observe()
 
 
 def wait_for(path):

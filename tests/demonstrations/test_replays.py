@@ -1,4 +1,4 @@
-"""Replays' folders: alignment, order, what is left alone, damage and zip bombs."""
+"""Replay folders: alignment, order, what is left alone, damage and zip bombs."""
 
 import io
 import os
@@ -50,7 +50,7 @@ ENTRIES = dreamer_entries(*PLAYED)
 
 @pytest.fixture(name="path")
 def _path(tmp_path):
-    """A sound file of one episode."""
+    """A valid file of one episode."""
     path = tmp_path / "episode.npz"
     save(path, ENTRIES)
     return path

@@ -22,7 +22,7 @@ CODECS = {  # name of the file: settings, largest error in grey levels
     # Rounding to whole values of another colour space, and back.
     "yuv.mp4": ({"codec": "libx264", "pixels": "yuv444p", "qp": "0"}, 3),
     "vp9.webm": ({"codec": "libvpx-vp9", "pixels": "gbrp", "lossless": "1"}, 0),
-    "mpeg4.avi": ({"codec": "ffv1", "pixels": "bgr0"}, 0),
+    "ffv1.avi": ({"codec": "ffv1", "pixels": "bgr0"}, 0),
     "two_colours.gif": ({"codec": "gif", "pixels": "rgb8"}, 3),
 }
 
@@ -77,7 +77,7 @@ def test_every_nth_frame_is_kept_from_the_first_on(path, frame_skip):
     assert recording.frames_per_second == pytest.approx(25 / frame_skip)
 
 
-def test_a_fraction_of_a_rate_is_exact(path):
+def test_a_fractional_rate_is_exact(path):
     encode_video(path, make_frames(), fps=Fraction(30000, 1001))
     assert read(path)[0].frames_per_second == pytest.approx(30000 / 1001, rel=1e-9)
 
@@ -88,7 +88,7 @@ def test_the_name_says_nothing(path):
     np.testing.assert_array_equal(read(other)[1][0].frames, make_frames())
 
 
-def test_frames_shown_for_unequal_times_are_told_and_kept(path):
+def test_unevenly_spaced_frames_are_kept_with_a_note(path):
     times = [time + 10 * (time >= 4) for time in range(12)]
     encode_video(path, make_frames(), times=times)
     recording, (episode,) = read(path)
@@ -114,7 +114,7 @@ def test_frames_are_scaled_while_they_are_decoded(path):
 
 
 @pytest.mark.parametrize("degrees", [90, 180, 270])
-def test_phones_that_are_held_upright(path, degrees):
+def test_rotated_videos_are_turned_upright(path, degrees):
     from av.sidedata.sidedata import Type
 
     colours = make_colours(size=32)[:, :16]

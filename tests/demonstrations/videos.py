@@ -39,5 +39,5 @@ def encode_video(
 
 
 def open_video(path: pathlib.Path, mode: Any = "r", **options: Any) -> Any:
-    """Opens a video by PyAV, whose own types of streams are too many."""
+    """Opens a video with PyAV; untyped, since its streams have many types."""
     return av.open(path, mode, **options)

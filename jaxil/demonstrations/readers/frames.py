@@ -42,29 +42,29 @@ def wanted_size(stored: tuple[int, int], options: ReadOptions) -> tuple[int, int
     return max(1, round(stored[0] * scale)), max(1, round(stored[1] * scale))
 
 
-def as_rgb(images: np.ndarray) -> np.ndarray:
-    """Returns images of other kinds as uint8 [..., H, W, 3].
+def as_rgb(image: np.ndarray) -> np.ndarray:
+    """Returns an image of another kind as uint8 [H, W, 3].
 
     Args:
-      images: gray [..., H, W] or [..., H, W, 1], RGB, or RGBA, whose alpha is dropped;
-        uint8, bool, uint16 of the full range, or floats in [0, 1].
+      image: gray [H, W] or [H, W, 1], RGB, or RGBA, whose alpha is dropped; uint8,
+        bool, uint16 of the full range, or floats in [0, 1].
 
     Raises:
       FormatError: another type or shape, or floats outside [0, 1].
     """
-    if images.ndim < 3 or images.shape[-1] not in (1, 3, 4):
-        images = images[..., None]
-    if images.dtype == np.uint16:
-        images = (images >> 8).astype(np.uint8)
-    elif images.dtype == bool:
-        images = images.astype(np.uint8) * np.uint8(255)
-    elif images.dtype.kind == "f":
-        if not (np.min(images) >= 0.0 and np.max(images) <= 1.0):
+    if image.ndim < 3 or image.shape[-1] not in (1, 3, 4):
+        image = image[..., None]
+    if image.dtype == np.uint16:
+        image = (image >> 8).astype(np.uint8)
+    elif image.dtype == bool:
+        image = image.astype(np.uint8) * np.uint8(255)
+    elif image.dtype.kind == "f":
+        if not (np.min(image) >= 0.0 and np.max(image) <= 1.0):
             raise FormatError("has images of real numbers outside [0, 1]")
-        images = np.rint(images * 255.0).astype(np.uint8)
-    if images.dtype != np.uint8:
-        raise FormatError(f"has images of type {images.dtype}")
-    return images[..., [0, 0, 0]] if images.shape[-1] == 1 else images[..., :3]
+        image = np.rint(image * 255.0).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise FormatError(f"has images of type {image.dtype}")
+    return image[..., [0, 0, 0]] if image.shape[-1] == 1 else image[..., :3]
 
 
 def newest_frames(observations: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@
 Source: conglu1997/v-d4rl, drqbc/utils.py.
 """
 
+import itertools
 import pathlib
 from collections.abc import Iterator
 
@@ -56,7 +57,7 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
             lengths = {len(array) for array in arrays}
             if lengths != {starts[file][-1]}:
                 raise FormatError(f"has arrays of different lengths: {sorted(lengths)}")
-            for begin, end in zip(starts[file][:-1], starts[file][1:]):
+            for begin, end in itertools.pairwise(starts[file]):
                 images, actions, rewards = (
                     minari.values(array, options, slice(begin, end)) for array in arrays
                 )

@@ -99,12 +99,12 @@ def _read_info(root: pathlib.Path, camera: str) -> _Dataset:
     version, features = info.get("codebase_version"), info.get("features")
     if not str(version).startswith("v3."):
         what = f"has codebase_version {version!r:.50}"
-        raise FormatError(f"{what}, not v3, to which LeRobot converts older ones")
+        raise FormatError(f"{what}, not v3; LeRobot can convert older datasets")
     for name, kind, most in (
         ("fps", int | float, _MAX_FPS),
         ("total_episodes", int, _MAX_EPISODES),
     ):
-        if not isinstance(info.get(name), kind) or not 0 < info[name] <= most:
+        if not isinstance(info.get(name), kind) or not 1 / most <= info[name] <= most:
             raise FormatError(f"has {name}={info.get(name)!r:.50} in {_INFO}")
     if not isinstance(features, dict):
         raise FormatError(f"has no features in {_INFO}")
@@ -137,6 +137,7 @@ def _read_info(root: pathlib.Path, camera: str) -> _Dataset:
 
 
 def _find_episodes(dataset: _Dataset) -> list[_Location]:
+    """Returns where each episode is stored, in order of their indices."""
     video = f"videos/{dataset.camera}/"
     names = ["episode_index", "length", "data/chunk_index", "data/file_index"]
     if dataset.is_video:
@@ -147,7 +148,8 @@ def _find_episodes(dataset: _Dataset) -> list[_Location]:
         rows += _read_table(file, names).to_pylist()
     episodes = []
     for row in rows:
-        *integers, start = [*row.values(), 0.0][: len(names) | 1]
+        integers = list(row.values())
+        start = integers.pop() if dataset.is_video else 0.0
         is_known = all(isinstance(value, int) for value in integers)
         if not is_known or not isinstance(start, float) or not 0 <= start < 1e9:
             raise FormatError(f"has an episode with an invalid location: {row}")
@@ -196,7 +198,7 @@ def _rows(
 def _video_frames(
     dataset: _Dataset, episodes: Sequence[_Location], options: ReadOptions
 ) -> Iterator[PixelEpisode | None]:
-    """Yields each episode's frames, and None as a sign of life."""
+    """Yields each episode's frames, and None as a heartbeat."""
     options = options._replace(frame_skip=1)
     for file, group in itertools.groupby(episodes, lambda episode: episode.video):
         assert file is not None

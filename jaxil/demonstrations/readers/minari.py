@@ -43,8 +43,9 @@ def recognises(path: pathlib.Path) -> bool:
 def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
     """Reads a dataset whose observations contain exactly one image.
 
-    It is stored as uint8 [H, W, 3], or as a JPEG, which Minari uses from 32x32 pixels,
-    alone or in a dictionary. Actions that are not vectors of real numbers are ignored.
+    The image is alone or in a dictionary, stored as uint8 [H, W, 3] or as a JPEG, which
+    Minari uses from 32x32 pixels on. Actions that are not vectors of real numbers are
+    ignored.
     """
     folder = _data_folder(path)
     metadata = {}  # older datasets have none
@@ -92,7 +93,7 @@ def _data_folder(path: pathlib.Path) -> pathlib.Path:
 
 
 def _task_of(metadata: dict[str, Any]) -> str | None:
-    """Returns the task of dm_control behind one of Shimmy's names."""
+    """Returns the dm_control task that one of Shimmy's environments wraps, if any."""
     try:
         name = json.loads(metadata["env_spec"])["id"]
         found = re.fullmatch(r"dm_control/([a-z_]+)-([a-z_]+)-v\d+", name)

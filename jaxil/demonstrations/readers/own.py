@@ -29,6 +29,7 @@ from jaxil.files import archive
 FORMAT = "jaxil-pixels"
 VERSION = 1
 _MAX_METADATA_BYTES = 1024**2
+_MAX_NUMBER = 10**9  # of an action repeat or frame rate; its inverse is the least
 _OPTIONAL = {"task": str, "action_repeat": int, "frames_per_second": float}
 
 
@@ -99,6 +100,10 @@ def _read_metadata(path: pathlib.Path) -> dict[str, Any]:
         value = metadata.get(name)
         if value is not None and (not isinstance(value, kind) or not value):
             raise FormatError(f"has metadata {name}={value!r}, not {kind.__name__}")
+        is_number = isinstance(value, int | float)
+        if is_number and not 1 / _MAX_NUMBER <= value <= _MAX_NUMBER:
+            limits = f"[{1 / _MAX_NUMBER:g}, {_MAX_NUMBER:g}]"
+            raise FormatError(f"has metadata {name}={value!r:.50}, not in {limits}")
     if not isinstance(metadata.get("origin"), str):
         raise FormatError("has metadata without origin")
     return {**dict.fromkeys(_OPTIONAL), **metadata}

@@ -1,8 +1,8 @@
 """Folders of PNG or JPEG frames, and NumPy arrays (.npy): pixels alone.
 
-A folder of pictures is one episode, and so is each subfolder of one that holds none. An
-array is one episode [T, H, W] or [T, H, W, C]. Files are in the order of their names,
-numbers by value.
+A folder of pictures is one episode; in a folder without any, each subfolder of pictures
+is one. An array is one episode [T, H, W] or [T, H, W, C]. Files are in the order of
+their names, numbers by value.
 """
 
 import pathlib
@@ -31,7 +31,7 @@ from jaxil.demonstrations.readers.recording import (
 _NPY = b"\x93NUMPY"
 _PICTURES = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")
 _MAX_PIXELS = 100e6  # of one picture
-_FRAMES_PER_SIGN = 30  # of life
+_FRAMES_PER_HEARTBEAT = 30
 
 
 def recognises(path: pathlib.Path) -> bool:
@@ -60,7 +60,7 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
                 name = f"{len(frames)} or more frames of {size[1]}x{size[0]} pixels,"
                 num_bytes = len(frames) * frames[0].nbytes
                 options.check_bytes(name, num_bytes, "; shrink or skip some")
-                if len(frames) % _FRAMES_PER_SIGN == 0:
+                if len(frames) % _FRAMES_PER_HEARTBEAT == 0:
                     yield None
             yield PixelEpisode(np.stack(frames), stored_size=stored)
 

@@ -2,8 +2,8 @@
 
 A reader is a module with two functions. `recognises(path)` decides by content whether
 it can read a file; it never raises. `read(path, options)` yields a `Recording` without
-episodes, and then each `PixelEpisode`, with None in between as a sign of life during
-long episodes. It raises FormatError if the file breaks its format's rules. Only regular
+episodes, and then each `PixelEpisode`, with None in between as a heartbeat during long
+episodes. It raises FormatError if the file breaks its format's rules. Only regular
 files are opened.
 """
 
@@ -31,10 +31,10 @@ class FormatError(ValueError):
 
 
 class ReadOptions(NamedTuple):
-    """Options of the caller. Videos and pictures scale at once, to save memory."""
+    """The caller's options. Videos and pictures are scaled as they are read."""
 
     max_bytes: int  # limit of an episode's frames and of any other array
-    frame_skip: int = 1  # keeps every n-th frame; videos skip the others at once
+    frame_skip: int = 1  # keeps every n-th frame; videos skip as they are read
     image_size: int | None = None  # height and width; None keeps the file's
     keep_aspect: bool = False  # only shrinks, until the shorter side is `image_size`
     fit: str = "stretch"  # one of `frames.FITS`: how other shapes become squares
@@ -108,7 +108,7 @@ def checked_episode(index: int, episode: PixelEpisode) -> PixelEpisode:
                 f"episode {index}, but numbers of {len(frames) - 1} steps on {axes} "
                 "axes are expected"
             )
-        with np.errstate(all="ignore"):  # too large numbers become infinite
+        with np.errstate(all="ignore"):  # numbers too large become infinite
             values = values.astype(np.float32, copy=False)
         if not np.isfinite(values).all():
             raise FormatError(f"has {name} in episode {index} that are not finite")

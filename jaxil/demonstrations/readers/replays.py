@@ -72,7 +72,7 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
 
 
 def _files(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Yields files that may be episodes; replays read no other suffix."""
+    """Yields the file, or those of a folder that may be episodes."""
     if path.is_dir():
         for file in sorted(path.iterdir()):
             if file.suffix == ".npz" and file.is_file():

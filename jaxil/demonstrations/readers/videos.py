@@ -28,7 +28,7 @@ _SUFFIXES = (".mp4", ".m4v", ".mov", ".gif", ".webm", ".mkv", ".avi")
 _BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")  # first in MP4 or MOV
 _MAX_ENTRIES = 1000  # of a folder, searched for videos
 _MAX_UNEVENNESS = 1.5  # longest time between two frames, over the shortest
-_FRAMES_PER_SIGN = 30  # of life
+_FRAMES_PER_HEARTBEAT = 30
 
 _Frame = tuple[np.ndarray, tuple[int, int]]  # scaled frame, size in the file
 
@@ -82,13 +82,14 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
                     f"has {other_rate:.4g} frames per second, but {files[0].name} has "
                     f"{rate:.4g}"
                 )
-            yield from collect(decode(file, options), options)
+            way_out = "; skip some with frame_skip"
+            yield from collect(decode(file, options), options, way_out)
 
 
 def collect(
-    frames: Iterable[_Frame], options: ReadOptions
+    frames: Iterable[_Frame], options: ReadOptions, way_out: str = ""
 ) -> Iterator[PixelEpisode | None]:
-    """Yields all frames as one episode, and None before as a sign of life."""
+    """Yields None as a heartbeat, and then all frames as one episode."""
     pixels = bytearray()  # grows without a second copy
     shape, stored_size, num_frames = (1, 1, 3), None, 0
     for frame, size in frames:
@@ -96,9 +97,9 @@ def collect(
             shape, stored_size = frame.shape, stored_size or size
             pixels += frame.tobytes()
             what = f"{num_frames + 1} or more frames of {shape[1]}x{shape[0]} pixels,"
-            options.check_bytes(what, len(pixels), "; skip some with frame_skip")
+            options.check_bytes(what, len(pixels), way_out)
         num_frames += 1
-        if num_frames % _FRAMES_PER_SIGN == 0:
+        if num_frames % _FRAMES_PER_HEARTBEAT == 0:
             yield None
     if num_frames <= options.frame_skip:
         too_few = f"too few for frame_skip={options.frame_skip}"
@@ -137,7 +138,10 @@ def timing(path: pathlib.Path) -> tuple[float | None, bool]:
 
 
 def _frames_of_gif(path: pathlib.Path) -> int:
-    """Returns the number of frames, since FFmpeg mistakes damage for the end."""
+    """Returns the number of frames, or -1 if the file is damaged.
+
+    FFmpeg mistakes damage for the end of the file.
+    """
     if not path.read_bytes().rstrip(b"\0\r\n ").endswith(b";"):
         return -1
     try:
