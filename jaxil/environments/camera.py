@@ -62,7 +62,7 @@ class Renderer:
 
     def render(self) -> np.ndarray:
         """Returns a new image, uint8 [H, W, 3]; RuntimeError without usable GL."""
-        image = self._opened().render(render_flag_overrides=self._flags)
+        image = self.open().render(render_flag_overrides=self._flags)
         n, size = self._factor, self.image_size
         if n == 1:
             return image.copy()  # the camera reuses its buffer
@@ -73,20 +73,21 @@ class Renderer:
 
     def gl_name(self) -> str:
         """Returns GL's name of the rendering device, e.g. "llvmpipe (...)"."""
-        self._opened()
+        self.open()
         from OpenGL import GL
 
         with self._physics.contexts.gl.make_current() as context:
             raw = context.call(GL.glGetString, GL.GL_RENDERER)
         return raw.decode() if isinstance(raw, bytes) else str(raw)
 
-    def _opened(self) -> Any:
+    def open(self) -> Any:
+        """Returns the dm_control `Camera`; the first call creates the GL context."""
         if self._camera is None:
             try:
                 self._camera = self._open_camera(
                     self._physics, self._size, self._camera_index
                 )
-            except Exception as error:  # MuJoCo's and GLFW's are of no common type
+            except Exception as error:  # MuJoCo's and GLFW's have no common class
                 raise RuntimeError(
                     f"rendering is not available: {error}; "
                     "`python -m jaxil.doctor` says what to install"

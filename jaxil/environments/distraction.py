@@ -1,8 +1,8 @@
-"""Looks that change from episode to episode and say nothing about the task.
+"""Visual distractions: changes of appearance that say nothing about the task.
 
 Colours, camera and background vary as in the Distracting Control Suite (Stone et al.
-2021), with its three strengths. Its videos in the background are random patterns here,
-so that no data are needed, and everything keeps still within an episode.
+2021), at its three strengths. Random patterns replace its background videos, so no data
+are needed, and all of it stays fixed within an episode.
 """
 
 import importlib
@@ -16,14 +16,14 @@ _COLOURS = ("mat_rgba", "geom_rgba")
 # Which of these a camera uses depends on whether it follows a body.
 _POSITIONS = ("cam_pos", "cam_pos0", "cam_poscom0")
 _CAMERA = (*_POSITIONS, "cam_quat", "cam_mat0")
-_PATCHES = 6  # of the pattern, along a side
+_PATCHES = 6  # of a background pattern, along a side
 
 
 class Distraction:
-    """Changes the looks of one simulation."""
+    """Varies the appearance of one simulation."""
 
     def __init__(self, physics: Any, camera: int, strength: str) -> None:
-        """Keeps the model's own looks; `strength` is a key of `STRENGTHS`."""
+        """Stores the original appearance; `strength` is a key of `STRENGTHS`."""
         self._physics, self._camera = physics, camera
         self._scale = STRENGTHS[strength]
         names = (*_COLOURS, *_CAMERA, "tex_data")
@@ -35,14 +35,16 @@ class Distraction:
         return self._scale > 0.0
 
     def restart(self, seeds: np.ndarray) -> None:
-        """Samples the looks of an episode."""
+        """Samples the appearance of an episode."""
         rng, model = np.random.default_rng(seeds), self._physics.model
         scale = self._scale
         for name in _COLOURS:
             colours = self._own[name].copy()
             colours[:, :3] += rng.uniform(-scale, scale, (len(colours), 3))
             getattr(model, name)[:] = np.clip(colours, 0.0, 1.0)
-        self._turn_camera(*rng.uniform(-scale, scale, 2) * np.pi / 2)
+        angles = rng.uniform(-scale, scale, 2) * np.pi / 2
+        if self._camera >= 0:  # -1 is the free camera, which is not in the model
+            self._turn_camera(*angles)
         weight = scale / max(STRENGTHS.values())
         for index in self._backgrounds():
             width = int(model.tex_width[index])
@@ -56,9 +58,8 @@ class Distraction:
             model.tex_data[texels] = mixed.astype(np.uint8)
 
     def upload(self) -> None:
-        """Hands the background to the GL context, which must exist."""
+        """Copies the background to the GL context, which must exist."""
         mujoco = _mujoco()
-
         model, contexts = self._physics.model, self._physics.contexts
         with contexts.gl.make_current() as context:
             for index in self._backgrounds():
@@ -66,9 +67,8 @@ class Distraction:
                 context.call(mujoco.mjr_uploadTexture, *arguments)
 
     def _backgrounds(self) -> list[int]:
-        """Returns the textures of sky and floor that are whole squares of RGB."""
+        """Returns the indices of the sky's and floors' textures, if of RGB squares."""
         mujoco = _mujoco()
-
         model, skybox = self._physics.model, mujoco.mjtTexture.mjTEXTURE_SKYBOX
         planes = model.geom_matid[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE]
         of_planes = model.mat_texid[planes[planes >= 0]].ravel()
@@ -83,7 +83,6 @@ class Distraction:
     def _turn_camera(self, yaw: float, roll: float) -> None:
         """Turns the camera about the vertical axis, and about its own."""
         mujoco = _mujoco()
-
         model, camera = self._physics.model, self._camera
         own = {name: self._own[name][camera] for name in _CAMERA}
         turn, tilt = _quaternion(yaw), _quaternion(roll)

@@ -16,7 +16,7 @@ class Evaluation(NamedTuple):
 
     episodes: list[Episode]  # with the task's rewards
     task_returns: np.ndarray  # undiscounted. Shape [E]
-    recorded: list[Any]  # of each moment of the first episode, [T + 1], or nothing
+    recorded: list[Any]  # what `record` returned, [T + 1]; else empty
 
     @property
     def mean(self) -> float:

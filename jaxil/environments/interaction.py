@@ -1,4 +1,4 @@
-"""What the loop needs of one simulator, and of several that run in parallel."""
+"""The interfaces of one environment, and of several that run in parallel."""
 
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -9,7 +9,7 @@ from dm_env import specs
 
 @runtime_checkable
 class Environment(Protocol):
-    """One simulator, stepped in agent steps: what training and evaluation need.
+    """What training and evaluation need of an environment, in agent steps.
 
     `PixelEnvironment` implements it for every kind of task. Tasks of dm_control are
     `Restorable` too.
@@ -59,10 +59,10 @@ class Environment(Protocol):
 
 @runtime_checkable
 class Restorable(Protocol):
-    """A simulator whose states can be stored, and rendered later."""
+    """An environment whose simulator states can be stored, and rendered later."""
 
     def simulator_state(self) -> dict[str, np.ndarray]:
-        """Returns arrays that determine the state, by name."""
+        """Returns the arrays that determine the simulator's state, by name."""
         ...
 
     def set_simulator_state(
@@ -82,18 +82,18 @@ class Moment(NamedTuple):
 
 
 class Environments(Protocol):
-    """Several simulators that run in the background."""
+    """Several environments that run in the background."""
 
-    size: int
+    size: int  # how many there are
 
     def reset(self, index: int, episode: int) -> None:
-        """Starts an episode in one simulator."""
+        """Starts an episode in one environment."""
 
     def step(self, index: int, action: np.ndarray) -> None:
         """Sends it an action, shape [A]."""
 
     def receive(self, index: int) -> Moment | None:
-        """Waits for the result; None if the simulator and its episode are lost."""
+        """Waits for the result; None if the environment and its episode are lost."""
         ...
 
     def close(self) -> None:

@@ -25,7 +25,7 @@ class PixelEnvironment(dm_env.Environment):
     requested.
 
     The image is the task's observation, if that is or holds one RGB image, else what
-    its `render()` returns; other sizes are scaled. Tasks may also offer
+    its `render()` returns, scaled if it has another size. Tasks may also offer
     `seed(number)`, called before each reset, `step_limit` (frames of a whole episode)
     and `frame_seconds`.
     """
@@ -169,7 +169,7 @@ class PixelEnvironment(dm_env.Environment):
         size = (side, side)
         if image.shape[:2] == size:
             return np.array(image)
-        # Pillow's bilinear filter grows with the scale, which prevents aliasing.
+        # Pillow widens its filter where it shrinks an image, which prevents aliasing.
         resized = Image.fromarray(image).resize(size, Image.Resampling.BILINEAR)
         return np.array(resized)
 
@@ -198,7 +198,7 @@ class PixelEnvironment(dm_env.Environment):
         self._simulator.close()
 
     def _restart(self, seeds: np.ndarray) -> dm_env.TimeStep:
-        """Starts an episode that eight numbers determine."""
+        """Starts the episode that `seeds`, uint32 [8], determine."""
         if hasattr(self._simulator, "seed"):
             self._simulator.seed(int(seeds[0]))
         return self._simulator.reset()

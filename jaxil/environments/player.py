@@ -11,29 +11,29 @@ from jaxil.maths.types import Episode
 
 
 class InProcess:
-    """One environment of this process, as `Environments`: it steps when waited for."""
+    """One environment in this process, as `Environments`: it steps in `receive`."""
 
     size = 1
 
     def __init__(self, environment: Any) -> None:
-        """Takes a `PixelEnvironment`, or anything with its methods."""
+        """Uses the environment's `reset`, `step` and `single_observation`."""
         self._environment = environment
-        self._order: Callable[[], Any] = lambda: None
+        self._request: Callable[[], Any] = lambda: None
 
     def reset(self, index: int, episode: int) -> None:
         """See `Environments`."""
         del index
-        self._order = lambda: self._environment.reset(episode=episode)
+        self._request = lambda: self._environment.reset(episode=episode)
 
     def step(self, index: int, action: np.ndarray) -> None:
         """See `Environments`."""
         del index
-        self._order = lambda: self._environment.step(action)
+        self._request = lambda: self._environment.step(action)
 
     def receive(self, index: int) -> Moment:
         """See `Environments`."""
         del index
-        timestep = self._order()
+        timestep = self._request()
         return Moment(
             observation=timestep.observation,
             frame=self._environment.single_observation(),
@@ -43,15 +43,15 @@ class InProcess:
         )
 
     def close(self) -> None:
-        """Does nothing: the environment is its maker's."""
+        """Does nothing: the environment's owner closes it."""
 
 
 @dataclasses.dataclass
 class _Open:
-    """An episode that is being played, so far.
+    """An episode that has begun and not ended.
 
     Attributes:
-      repeated: actions with which it begins, of an earlier process.
+      repeated: actions of an earlier process, with which it begins.
     """
 
     number: int
@@ -137,7 +137,7 @@ class Player:
 
     @property
     def observations(self) -> np.ndarray:
-        """What the open episodes show, in the order of their numbers: [E, ...]."""
+        """The open episodes' observations, in the order of their numbers: [E, ...]."""
         shown = [self._open[index].observation for index in self._order()]
         return np.stack([each for each in shown if each is not None])
 
@@ -149,11 +149,11 @@ class Player:
     @property
     def open_episodes(self) -> dict[int, np.ndarray]:
         """The actions [t, A] of each open episode by its number."""
-        found = {e.number: np.array(e.actions) for e in self._open.values()}
-        return {**{n: np.array(a) for n, a in self._waiting.items()}, **found}
+        waiting = {n: np.array(actions) for n, actions in self._waiting.items()}
+        return waiting | {e.number: np.array(e.actions) for e in self._open.values()}
 
     def steps_left(self, episode_steps: int) -> int:
-        """Returns the agent steps that open episodes of a length still need."""
+        """Returns the steps left in the open episodes, if all have this length."""
         played = [max(len(e.actions), len(e.repeated)) for e in self._open.values()]
         return sum(max(episode_steps - steps, 0) for steps in played)
 
@@ -163,7 +163,7 @@ class Player:
             self._step(index, action)
 
     def observe(self) -> list[Episode]:
-        """Waits for what comes of the actions.
+        """Waits for the results of the actions.
 
         Returns:
           The episodes that ended, in the order of their numbers.

@@ -16,8 +16,8 @@ import numpy as np
 from jaxil.environments.interaction import Moment
 from jaxil.environments.player import InProcess
 
-# In software the heaviest task takes a second per step; imports and the first image
-# take 5 s, or a minute on a busy machine.
+# Rendered in software, the heaviest task takes a second per step; imports and the first
+# image take 5 s, or a minute on a busy machine.
 _STEP_SECONDS, _START_SECONDS = 60.0, 300.0
 _EXIT_SECONDS = 10.0  # for a killed process to disappear
 _MAX_LOSSES = 3  # in a row, without a whole episode
@@ -45,7 +45,7 @@ class Pool:
     """Separate processes as `interaction.Environments`.
 
     A process that dies or hangs is replaced when the next episode starts. All processes
-    end with the parent, even if that is killed.
+    end with the parent, even if it is killed.
     """
 
     def __init__(
@@ -151,8 +151,8 @@ class _Worker:
     def receive(self, seconds: float) -> Moment | str:
         """Returns the result, or why there is none.
 
-        After an error of the environment `has_raised` is set, and this is its
-        traceback.
+        If the environment raised an error, this is the traceback, and `has_raised` is
+        set.
         """
         try:
             if not self._pipe.poll(seconds):

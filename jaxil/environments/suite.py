@@ -8,6 +8,7 @@ import functools
 import importlib.metadata
 import logging
 import os
+from collections.abc import Mapping
 from typing import Any
 
 import dm_env
@@ -19,13 +20,14 @@ from jaxil.environments.pixel_environment import PixelEnvironment, flat_state
 from jaxil.machine import startup
 
 OBSERVATIONS = ("pixels", "state")
+_missing_gl: list[str] = []  # why the GL backend in MUJOCO_GL is not used
 
 
 @functools.cache
 def _suite() -> Any:
     """Imports dm_control's suite, which chooses the GL backend for good.
 
-    A backend that is not available is replaced by none, since states need no images.
+    An unavailable backend is replaced by none, since states need no images.
     """
     startup.choose_gl()
     backend = os.environ["MUJOCO_GL"]
@@ -44,10 +46,6 @@ def _suite() -> Any:
         lambda record: "settotalmass" not in record.getMessage()
     )
     return suite
-
-
-# Why the backend that the user chose is not used.
-_missing_gl: list[str] = []
 
 
 @functools.cache
@@ -95,12 +93,12 @@ class SuiteEnvironment(PixelEnvironment):
         simulator: Any,
         *,
         image_size: int,
-        camera: int = 0,
-        distraction: str = "none",
-        render_quality: str = "paper",
+        camera: int,
+        distraction: str,
+        render_quality: str,
         **settings: Any,
     ):
-        """Wraps an environment of `dm_control`; see `make_environment`."""
+        """Wraps an environment of dm_control, `camera` being an index; see `wrap`."""
         super().__init__(simulator, image_size=image_size, **settings)
         self.renderer = Renderer(
             simulator.physics,
@@ -114,9 +112,9 @@ class SuiteEnvironment(PixelEnvironment):
     def render(self, image_size: int | None = None) -> np.ndarray:
         """Returns a new image of the agent's size; RuntimeError without usable GL."""
         if image_size not in (None, self.image_size):
-            raise ValueError(f"image_size={image_size}: the camera's is fixed")
+            raise ValueError(f"image_size={image_size}: the camera's size is fixed")
         if self._distraction.is_on:
-            self.renderer.gl_name()  # opens the context
+            self.renderer.open()
             self._distraction.upload()
         return self.renderer.render()
 
@@ -182,7 +180,7 @@ class SuiteEnvironment(PixelEnvironment):
         return self._simulator.reset()
 
     def _state(self) -> np.ndarray:
-        # Not the step's own, which a new simulator state does not change.
+        # The step's observation would not follow `set_simulator_state`.
         return flat_state(self._simulator.task.get_observation(self.physics))
 
 
@@ -216,54 +214,62 @@ def make_environment(
     Raises:
       ValueError: one of these is unknown or out of range.
     """
-    for name, value, least in (
-        ("seed", seed, 0),
-        ("action_repeat", action_repeat, 1),
-        ("image_size", image_size, 1),
-        ("frame_stack", frame_stack, 1),
+    settings: dict[str, Any] = {
+        "seed": seed,
+        "action_repeat": action_repeat,
+        "image_size": image_size,
+        "frame_stack": frame_stack,
+        "observation": observation,
+        "render_quality": render_quality,
+        "camera": camera,
+        "distraction": distraction,
+        "max_episode_frames": max_episode_frames,
+    }
+    check_settings(settings)
+    simulator = _suite().load(*split_task(task), task_kwargs={"random": seed})
+    return wrap(simulator, default_camera=camera_of(task), **settings)
+
+
+def check_settings(settings: Mapping[str, Any]) -> None:
+    """Raises ValueError for an argument of `make_environment` out of range."""
+    for name, least in (
+        ("seed", 0),
+        ("action_repeat", 1),
+        ("image_size", 1),
+        ("frame_stack", 1),
     ):
+        value = settings[name]
         if value < least:
             raise ValueError(f"{name}={value} must be at least {least}.")
-    for name, value, known in (
-        ("observation", observation, OBSERVATIONS),
-        ("render_quality", render_quality, RENDER_QUALITIES),
-        ("distraction", distraction, STRENGTHS),
+    for name, known in (
+        ("observation", OBSERVATIONS),
+        ("render_quality", RENDER_QUALITIES),
+        ("distraction", STRENGTHS),
     ):
+        value = settings[name]
         if value not in known:
             names = ", ".join(known)
             raise ValueError(f"{name}={value!r} is unknown; choose one of: {names}.")
-    simulator = _suite().load(*split_task(task), task_kwargs={"random": seed})
-    return wrap(
-        simulator,
-        default_camera=camera_of(task),
-        seed=seed,
-        action_repeat=action_repeat,
-        image_size=image_size,
-        frame_stack=frame_stack,
-        observation=observation,
-        render_quality=render_quality,
-        camera=camera,
-        distraction=distraction,
-        max_episode_frames=max_episode_frames,
-    )
 
 
 def wrap(
     simulator: Any, *, camera: str, default_camera: int = 0, **settings: Any
 ) -> SuiteEnvironment:
-    """Makes one of an environment of dm_control; see `make_environment`."""
+    """Wraps an environment of dm_control; other arguments as for `make_environment`."""
     index = camera_index(simulator.physics.model, camera, default_camera)
     return SuiteEnvironment(simulator, camera=index, **settings)
 
 
 def camera_index(model: Any, camera: str, default: int = 0) -> int:
-    """Returns the index of a camera by its name or number.
+    """Returns the index of a camera by its name or number; `default` for "".
+
+    A model without cameras has MuJoCo's free one, of index -1.
 
     Raises:
       ValueError: the model has none like that.
     """
     if not camera:
-        return default
+        return default if model.ncam else -1
     names = [model.id2name(index, "camera") for index in range(model.ncam)]
     numbers = [str(index) for index in range(model.ncam)]
     for known in (names, numbers):

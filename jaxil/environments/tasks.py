@@ -4,8 +4,8 @@
     gymnasium:ID               of Gymnasium, with continuous actions
     package.module:function    of the user: returns a dm_env.Environment
 
-Environments of the user that are built as the suite's are can do whatever those can;
-of dm_control's others, such as composer's, the camera can be chosen.
+A user's environment that is built like the suite's takes every setting that those take;
+any other of dm_control, such as composer's, takes a camera but no distraction.
 """
 
 import atexit
@@ -31,7 +31,6 @@ _DEFAULTS = {
     "camera": "",
     "distraction": "none",
 }
-_OF_DM_CONTROL = ("render_quality", "camera", "distraction")
 
 
 def is_of_suite(task: str) -> bool:
@@ -40,7 +39,7 @@ def is_of_suite(task: str) -> bool:
 
 
 def names_code(task: str) -> bool:
-    """Returns whether a task's name makes Python import a module that it names."""
+    """Returns whether making a task imports a module that its name contains."""
     return ":" in task.removeprefix(_GYMNASIUM)
 
 
@@ -48,8 +47,7 @@ def problems(task: str, **settings: Any) -> list[Fault]:
     """Tries a task: makes it, resets it, takes a step, and looks at it.
 
     Args:
-      task: with `gymnasium:` or of the user; any of the suite is only made if its
-        camera has to be looked up.
+      task: one of the suite is only made, and only if a camera has to be looked up.
       settings: those of `make_environment`.
     """
     if is_of_suite(task) and not settings["camera"]:
@@ -75,30 +73,34 @@ def make_environment(
 ) -> PixelEnvironment:
     """Makes the environment of `task`; other arguments as for the suite's.
 
-    `render_quality`, `camera` and `distraction` are the suite's alone.
+    Outside dm_control, `render_quality` has no effect, and `camera` and `distraction`
+    are refused.
 
     Raises:
-      UsageError: there is no such task, or a package is missing.
+      UsageError: there is no such task, a package is missing, or a setting does not
+        apply to the task.
       ValueError: a setting is out of range, or the task cannot be used.
     """
     if is_of_suite(task):
         return suite.make_environment(
             task, seed=seed, image_size=image_size, **settings
         )
+    settings = {**_DEFAULTS, **settings, "seed": seed, "image_size": image_size}
+    suite.check_settings(settings)
     if task.startswith(_GYMNASIUM):
         simulator: Any = _Gymnasium(task.removeprefix(_GYMNASIUM), image_size)
     else:
         simulator = outside.load(task, "task")()
-    settings = {**_DEFAULTS, **settings, "seed": seed, "image_size": image_size}
     own_task = getattr(simulator, "task", None)
     if isinstance(getattr(own_task, "random", None), np.random.RandomState):
         return suite.wrap(simulator, **settings)
     if hasattr(simulator, "physics") and not hasattr(simulator, "render"):
         simulator = _DmControl(simulator, settings["camera"])
         settings["camera"] = ""
-    for name in _OF_DM_CONTROL:
+    del settings["render_quality"]
+    for name in ("camera", "distraction"):
         value = settings.pop(name)
-        if name != "render_quality" and value != _DEFAULTS[name]:
+        if value != _DEFAULTS[name]:
             raise UsageError(
                 Fault(name, "is for tasks of dm_control's suite", value=value)
             )
@@ -116,7 +118,7 @@ def timing(task: str, action_repeat: int) -> tuple[float | None, int | None]:
 
 
 class _DmControl:
-    """An environment of dm_control that is not built as the suite's: composer's, say.
+    """An environment of dm_control that is not built like the suite's, say composer's.
 
     It can be seeded if it has a `random_state`.
     """
@@ -125,9 +127,7 @@ class _DmControl:
 
     def __init__(self, inner: Any, camera: str) -> None:
         self._inner = inner
-        model = inner.physics.model
-        # Without cameras, MuJoCo's free one.
-        self._camera = suite.camera_index(model, camera, 0 if model.ncam else -1)
+        self._camera = suite.camera_index(inner.physics.model, camera)
         self.frame_seconds = inner.control_timestep()
         seconds = getattr(inner, "_time_limit", math.inf)
         frames = getattr(inner, "_step_limit", seconds / self.frame_seconds)
@@ -182,8 +182,6 @@ class _Gymnasium(dm_env.Environment):
                 f"has actions {space}, but needs a vector of numbers (Box)"
             )
         self._space = space
-        observed: Any = self._inner.observation_space
-        self._observed = _spec_of(observed)
         spec, inner = self._inner.spec, self._inner.unwrapped
         self.step_limit = spec and spec.max_episode_steps
         rate = inner.metadata.get("render_fps")
@@ -217,7 +215,7 @@ class _Gymnasium(dm_env.Environment):
         self._enter_context()
         image = self._inner.render()
         if not self._is_rendered:
-            # At the interpreter's end the GL library, which is open now, goes first.
+            # The GL library is open by now, so this runs before its own exit handler.
             atexit.register(self.close)
             self._is_rendered = True
         return image
@@ -229,7 +227,7 @@ class _Gymnasium(dm_env.Environment):
 
     def observation_spec(self) -> Any:
         """Returns specs of a vector, an image, or a dictionary of them."""
-        return self._observed
+        return _spec_of(self._inner.observation_space)
 
     def close(self) -> None:
         """Frees the simulation."""

@@ -46,8 +46,8 @@ def read_archive(
 
     Sizes are checked in the headers of archive and arrays before anything is unpacked.
 
-    `max_bytes` is the largest unpacked size of each array to read. The largest of these
-    limits also bounds their sum.
+    `max_bytes` names the arrays to read and limits the unpacked size of each; the
+    largest limit also holds for all of them together.
 
     Raises:
       OSError: the file cannot be opened, or is not a regular file.
@@ -65,7 +65,7 @@ def read_archive(
                 members = {name: stored[f"{name}.npy"] for name in max_bytes}
                 file_bytes = os.fstat(file.fileno()).st_size
                 for name, info in members.items():
-                    _check_size(name, info, min(max_bytes[name], budget), file_bytes)
+                    _check_size(name, info, max_bytes[name], file_bytes)
                     num_bytes += info.file_size
                 if num_bytes > budget:
                     raise ValueError(

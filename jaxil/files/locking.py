@@ -17,8 +17,8 @@ from jaxil.files.untrusted import read_regular
 # Reported by file systems without locks (some NFS and Lustre mounts).
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 _HEARTBEAT_SECONDS = 60.0
-# Without a heartbeat for so long, an owner elsewhere is dead; clocks of machines that
-# share a file system may differ by less.
+# An owner elsewhere counts as dead after so long without a heartbeat; the clocks of
+# machines that share a file system must differ by less.
 _DEAD_SECONDS = 600.0
 
 
@@ -30,10 +30,10 @@ class InUseError(Exception):
 def locked(path: pathlib.Path) -> Iterator[None]:
     """Holds the lock on a file, creating the file if it is missing.
 
-    Without file-system locks, PATH.owner replaces the lock: a file, created
-    exclusively, that describes the process and is touched every minute. It is taken
-    over once its process is known to have ended: on the same machine since the same
-    start, the process table says so; elsewhere, ten minutes without a touch do.
+    On a file system without locks, PATH.owner stands in: a file, created exclusively,
+    that names the process and is touched every minute. It is taken over once that
+    process has ended or, if it is of another machine, boot or container, once the file
+    has not been touched for ten minutes.
 
     Raises:
       InUseError: another process holds the lock.
@@ -55,7 +55,10 @@ def locked(path: pathlib.Path) -> Iterator[None]:
 
 
 def is_locked(path: pathlib.Path) -> bool:
-    """Returns whether another process holds the lock on a file."""
+    """Returns whether another process holds the lock on a file.
+
+    One that exists but cannot be opened counts as locked.
+    """
     try:
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK)) as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -70,12 +73,10 @@ def is_locked(path: pathlib.Path) -> bool:
 
 @contextlib.contextmanager
 def _owned(path: pathlib.Path) -> Iterator[None]:
-    if _owner(path) is None:
-        path.unlink(missing_ok=True)
+    since = time.strftime("%F %T")
+    owner = json.dumps([*_machine(), os.getpid(), _start(os.getpid()), since])
     try:
-        with path.open("x") as file:
-            since = time.strftime("%F %T")
-            json.dump([*_machine(), os.getpid(), _start(os.getpid()), since], file)
+        _claim(path, owner)
     except FileExistsError as error:
         raise InUseError(
             f"in use by {_owner(path) or 'another process'} (if that has ended, "
@@ -96,8 +97,31 @@ def _owned(path: pathlib.Path) -> Iterator[None]:
         path.unlink(missing_ok=True)
 
 
+def _claim(path: pathlib.Path, owner: str) -> None:
+    """Creates the owner's file, in place of one whose owner has ended.
+
+    One process at a time: otherwise two could find the same owner dead, and the second
+    would remove the first one's file.
+
+    Raises:
+      FileExistsError: another process owns it or is claiming it.
+    """
+    claim = path.with_name(f"{path.name}.claim")
+    with contextlib.suppress(FileNotFoundError):
+        if time.time() - claim.stat().st_mtime > _DEAD_SECONDS:  # killed in between
+            claim.unlink()
+    claim.touch(exist_ok=False)
+    try:
+        if _owner(path) is None:
+            path.unlink(missing_ok=True)
+        with path.open("x") as file:
+            file.write(owner)
+    finally:
+        claim.unlink(missing_ok=True)
+
+
 def _owner(path: pathlib.Path) -> str | None:
-    """Describes the owner; None if there is none, or if it has ended."""
+    """Returns a description of the owner; None if there is none or it has ended."""
     is_old = False
     try:
         is_old = time.time() - path.stat().st_mtime > _DEAD_SECONDS
@@ -115,17 +139,17 @@ def _owner(path: pathlib.Path) -> str | None:
 
 
 def _machine() -> list[str]:
-    """Returns what tells apart machines, their restarts, and containers there."""
+    """Returns what identifies this machine, its last boot and the container."""
     boot = pathlib.Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     return [platform.node(), boot, str(pathlib.Path("/proc/self/ns/pid").readlink())]
 
 
 def _start(process: int) -> str | None:
-    """Returns when a process has begun, in ticks; None if it has ended."""
+    """Returns when a process began, in clock ticks; None if it has ended."""
     try:
         stat = pathlib.Path(f"/proc/{process}/stat").read_text()
     except OSError:
         return None
-    # After the name in brackets: the state, and 18 numbers.
+    # After the name in brackets: the state, 18 numbers, and the start.
     state, *numbers = stat.rpartition(")")[2].split()
     return None if state in "ZX" else numbers[18]

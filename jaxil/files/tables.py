@@ -32,7 +32,7 @@ class CsvLog:
             dropped, and new ones are empty in old rows.
           resume_frame: rows after this frame are dropped, as is an incomplete last
             line.
-          say: told if the old file is damaged; that file is then renamed.
+          say: receives a message if the old file is damaged, which is then renamed.
         """
         self._path = pathlib.Path(path)
         self._columns = tuple(columns)
@@ -95,7 +95,7 @@ def _read(path: pathlib.Path) -> tuple[list[str], list[dict[str, str]]]:
     """Returns the names of the columns, and the rows."""
     content = untrusted.read_regular(path)
     try:
-        # A kill in mid-write leaves a last line without an end.
+        # A kill in mid-write leaves a last line without a line end.
         text = content[: content.rfind(b"\n") + 1].decode()
         columns, *rows = [*csv.reader(io.StringIO(text))] or [[]]
         table = [dict(zip(columns, row, strict=True)) for row in rows if row]

@@ -57,6 +57,6 @@ def remove_leftovers(folder: pathlib.Path, *, min_age_seconds: float = 0.0) -> N
         return
     for path in folder.iterdir():
         if _TEMPORARY.fullmatch(path.name):
-            with contextlib.suppress(FileNotFoundError):  # by another process
+            with contextlib.suppress(FileNotFoundError):  # removed by another process
                 if time.time() - path.lstat().st_mtime >= min_age_seconds:
                     remove(path)

@@ -18,6 +18,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
@@ -56,7 +57,6 @@ def results(
       ChildError: the function raised an error or took too long, or the process died.
     """
     ours, theirs = socket.socketpair()
-    ours.settimeout(seconds)
     folders = [folder or os.getcwd() for folder in sys.path]
     code = f"import sys; sys.path[:] = {folders!r}; from jaxil.machine import child"
     with theirs:
@@ -70,16 +70,19 @@ def results(
     try:
         with ours, ours.makefile("rb") as stream:
             work = pickle.dumps((function, arguments, cpu_seconds, memory_bytes))
+            ours.settimeout(seconds)
             with contextlib.suppress(OSError):  # it died, which reading reports
                 ours.sendall(work)
+            ours.settimeout(None)
             while True:
-                try:
-                    outcome, value = _receive(stream, result_bytes)
-                except TimeoutError as error:
-                    text = f"no result within {seconds} s"
-                    raise ChildError("timeout", text) from error
-                except Exception as error:  # a broken child may send anything
-                    raise _death(process, cpu_seconds) from error
+                with _deadline(ours, seconds) as is_late:
+                    try:
+                        outcome, value = _receive(stream, result_bytes)
+                    except Exception as error:  # a broken child may send anything
+                        if is_late.is_set():
+                            text = f"no result within {seconds} s"
+                            raise ChildError("timeout", text) from error
+                        raise _death(process, cpu_seconds) from error
                 if outcome == "error":
                     raise ChildError(*map(str, value))
                 if outcome == "end":
@@ -113,6 +116,31 @@ def serve(handle: int) -> None:
             except BaseException as error:
                 outcome, value = "error", [type(error).__name__, str(error)[:10_000]]
             _send(stream, outcome, value)
+
+
+@contextlib.contextmanager
+def _deadline(connection: socket.socket, seconds: float) -> Iterator[threading.Event]:
+    """Ends reading after `seconds` and then sets the event.
+
+    The socket's own timeout would begin anew with every byte.
+    """
+    is_late = threading.Event()
+
+    def end() -> None:
+        is_late.set()
+        with contextlib.suppress(
+            OSError
+        ):  # the child closed it, which also ends reading
+            connection.shutdown(socket.SHUT_RD)
+
+    timer = threading.Timer(seconds, end)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield is_late
+    finally:
+        timer.cancel()
+        timer.join()
 
 
 def _limit(kind: int, amount: int) -> None:

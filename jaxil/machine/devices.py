@@ -1,6 +1,6 @@
-"""Processor, accelerator and its memory.
+"""The processor, the accelerator and its memory.
 
-jax is imported inside functions, so that start-up can use the others before it.
+Only functions that need jax import it: start-up calls the others before that.
 """
 
 import glob

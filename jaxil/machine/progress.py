@@ -82,8 +82,8 @@ class ProgressLine:
         Args:
           frame: environment frames so far.
           seconds: spent so far by activity; what is missing is shown as "rest".
-          returns: those of the last episode by name, another mapping for each episode;
-            the first name's are shown as a sparkline, too.
+          returns: of the last episode, by name; a new mapping object for each episode.
+            Those of the first name are also shown as a sparkline.
         """
         if returns and returns is not self._newest:
             self._newest = returns
@@ -150,7 +150,7 @@ def _sparkline(values: Sequence[float]) -> str:
 
 @contextlib.contextmanager
 def shown(label: str, unit: str = "images") -> Iterator[Callable[[int, int], None]]:
-    """Yields a function (done, all) that shows a progress line in this block."""
+    """Yields a function (done, total) that shows a progress line in this block."""
     with contextlib.ExitStack() as stack:
         lines: list[ProgressLine] = []
 

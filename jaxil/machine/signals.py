@@ -14,12 +14,12 @@ _NAMES = {
 class StopOnSignals:
     """Makes the first signal a request to stop, and the second end the process.
 
-    A second SIGHUP is ignored, since shell and kernel may each send one. Under `nohup`
-    all of them are ignored.
+    A second SIGHUP is ignored, since shell and kernel may each send one; under `nohup`
+    the first is, too.
     """
 
     def __init__(self, ask: Callable[[str], bool]) -> None:
-        """Takes a function from a signal's name to whether it is the first."""
+        """`ask`, called with the signal's name, returns whether this is the first."""
         self._ask = ask
 
     def __enter__(self) -> None:

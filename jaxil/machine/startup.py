@@ -1,4 +1,4 @@
-"""Settings before jax and mujoco are imported: GL, XLA flags, malloc.
+"""Sets GL, XLA flags and malloc, before jax and mujoco are imported.
 
 Both read their settings once, so commands call `prepare` before they import either.
 What the user has set is not changed.
@@ -22,7 +22,8 @@ _NO_YNN_FUSION = "--xla_cpu_experimental_ynn_fusion_type="
 # What apt-get installs on Debian and Ubuntu for GL without a screen.
 GL_PACKAGES = ("libegl1", "libgl1-mesa-dri", "libosmesa6")
 # EGL loads even without a driver, so the probe creates a context. It is a separate
-# process because the choice of a backend is final.
+# process because the choice of a backend is final, and has a second try because some
+# drivers hang once in hundreds of tries.
 _GL_PROBE = """
 import os
 import dm_control._render as render
@@ -31,13 +32,12 @@ with context.make_current() as current:
     current.call(lambda: None)
 os._exit(0)
 """
-_GL_PROBE_SECONDS = 15.0
+_GL_PROBE_SECONDS, _GL_PROBE_TRIES = 15.0, 2
 # As dm_control spells them.
 _GL_BACKENDS = (
     *("", "glfw", "on", "enable", "enabled", "true", "1", "egl", "osmesa"),
     *("disable", "disabled", "off", "false", "0"),
 )
-_GL_PROBE_TRIES = 2  # some drivers hang once in hundreds of tries
 # Options of glibc's malloc.h that keep freed memory in the process: all blocks come
 # from one heap, which is never trimmed.
 _MALLOC_SETTINGS = (
@@ -98,7 +98,7 @@ def choose_gl() -> str:
     """Sets MUJOCO_GL if it is unset; returns a few words about it.
 
     Raises:
-      UsageError: it is set to what no backend is called.
+      UsageError: its value is not the name of a backend.
     """
     chosen = os.environ.get("MUJOCO_GL")
     if chosen is not None:

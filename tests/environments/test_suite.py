@@ -1,12 +1,16 @@
 """The environment against the raw suite, against itself replayed, and by hand."""
 
+import re
+
 import dm_env
 import numpy as np
 import pytest
 from dm_control import suite as dm_suite
+from dm_control.rl import control
+from dm_control.suite import pendulum
 from dm_env import specs
 
-from jaxil.environments import suite
+from jaxil.environments import suite, tasks
 from jaxil.environments.interaction import Environment
 from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.environments.suite import SuiteEnvironment, make_environment
@@ -14,7 +18,6 @@ from jaxil.environments.suite import SuiteEnvironment, make_environment
 SIZE = 24
 # Plain, with a moving camera, with a string, with a target drawn at each reset.
 TASKS = ("cartpole_swingup", "walker_walk", "ball_in_cup_catch", "finger_turn_hard")
-
 
 _made: list[PixelEnvironment] = []
 
@@ -35,9 +38,9 @@ def _close_environments():
         _made.pop().close()
 
 
-def random_actions(environment, number, seed=0):
+def random_actions(environment, number):
     shape = (number, *environment.action_spec().shape)
-    return np.random.default_rng(seed).uniform(-1, 1, shape).astype(np.float32)
+    return np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
 
 
 class Countdown:
@@ -45,9 +48,7 @@ class Countdown:
 
     step_limit = 5
 
-    def __init__(self, last_discount=0.0):
-        self.last_discount = last_discount
-        self.controls = []
+    def __init__(self):
         self.seen = {"position": np.array([[1.0, 2.0]]), "height": np.float64(3.0)}
 
     def reset(self):
@@ -55,14 +56,11 @@ class Countdown:
         return dm_env.restart(self.seen)
 
     def step(self, control):
+        reward = 2.0 ** len(self.controls)
         self.controls.append(control)
-        number = len(self.controls)
-        reward = 2.0 ** (number - 1)
-        if number == 5:
-            return dm_env.TimeStep(
-                dm_env.StepType.LAST, reward, self.last_discount, self.seen
-            )
-        return dm_env.TimeStep(dm_env.StepType.MID, reward, 0.5, self.seen)
+        if len(self.controls) == self.step_limit:
+            return dm_env.termination(reward, self.seen)
+        return dm_env.transition(reward, self.seen, discount=0.5)
 
     def observation_spec(self):
         return {
@@ -75,14 +73,8 @@ class Countdown:
 
 
 def countdown(simulator=None) -> PixelEnvironment:
-    return PixelEnvironment(
-        simulator or Countdown(),
-        seed=0,
-        action_repeat=2,
-        image_size=SIZE,
-        frame_stack=3,
-        observation="state",
-    )
+    settings = {"seed": 0, "action_repeat": 2, "image_size": SIZE, "frame_stack": 3}
+    return PixelEnvironment(simulator or Countdown(), **settings, observation="state")
 
 
 # --- time ---------------------------------------------------------------------------
@@ -196,19 +188,26 @@ def test_states_are_flat_and_drawn_only_when_asked():
 
 
 def test_qualities_look_different():
-    paper, fast = small(render_quality="paper"), small(render_quality="fast")
-    difference = np.abs(
-        paper.reset().observation.astype(int) - fast.reset().observation
+    paper, fast = (
+        small(render_quality=quality).reset().observation.astype(int)
+        for quality in ("paper", "fast")
     )
-    assert 0.0 < difference.mean() < 20.0, "the same scene, drawn in two ways"
+    assert 0.0 < np.abs(paper - fast).mean() < 20.0, "the same scene, drawn in two ways"
+
+
+def test_smooth_is_the_mean_of_four_pixels_of_fast():
+    fast = small(image_size=2 * SIZE).reset().observation.astype(int)
+    means = fast.reshape(SIZE, 2, SIZE, 2, -1).mean((1, 3))
+    smooth = small(render_quality="smooth").reset().observation
+    assert smooth.shape == (SIZE, SIZE, 9)
+    np.testing.assert_allclose(smooth, means, atol=0.5)
 
 
 def test_cameras_are_chosen_by_name_or_number():
     usual = small("walker_walk").reset(0).observation
     for camera in ("0", "side"):
-        np.testing.assert_array_equal(
-            small("walker_walk", camera=camera).reset(0).observation, usual
-        )
+        seen = small("walker_walk", camera=camera).reset(0).observation
+        np.testing.assert_array_equal(seen, usual)
     back = small("walker_walk", camera="back").reset(0).observation
     assert not np.array_equal(back, usual)
     with pytest.raises(ValueError, match="the task has: 0 side, 1 back"):
@@ -236,15 +235,20 @@ def test_distractions_are_fixed_by_seed_and_number_and_grow_with_their_strength(
     assert distances[1] > 5.0
 
 
+def without_cameras():
+    xml, assets = pendulum.get_model_and_assets()
+    physics = pendulum.Physics.from_xml_string(re.sub(rb"<camera.*", b"", xml), assets)
+    return control.Environment(physics, pendulum.SwingUp(random=0))
+
+
+def test_a_model_without_cameras_is_seen_by_the_free_one():
+    for look in ("none", "hard"):
+        task, settings = f"{__name__}:without_cameras", {"distraction": look}
+        _made.append(tasks.make_environment(task, seed=0, image_size=SIZE, **settings))
+        assert _made[-1].reset(0).observation.std() > 0
+
+
 # --- reproducibility ------------------------------------------------------------------
-
-
-def test_smooth_is_the_mean_of_four_pixels_of_fast():
-    fast = small(image_size=2 * SIZE).reset().observation.astype(int)
-    means = fast.reshape(SIZE, 2, SIZE, 2, -1).mean((1, 3))
-    smooth = small(render_quality="smooth").reset().observation
-    assert smooth.shape == (SIZE, SIZE, 9)
-    np.testing.assert_allclose(smooth, means, atol=0.5)
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -294,7 +298,7 @@ def test_tasks_are_split_at_the_domain():
     assert len(suite.known_tasks()) == len(set(suite.known_tasks()))
 
 
-def test_cameras_are_those_of_the_field():
+def test_cameras_are_those_of_drqv2():
     assert suite.camera_of("quadruped_walk") == 2
     assert suite.camera_of("humanoid_CMU_run") == 0
 
@@ -316,6 +320,9 @@ def test_cameras_are_those_of_the_field():
 def test_faults_name_value_and_rule(changes, message):
     with pytest.raises(ValueError, match=message):
         small(**changes)
+    if "task" not in changes:  # the user's own tasks are checked in the same way
+        with pytest.raises(ValueError, match=message):
+            tasks.make_environment(f"{__name__}:Countdown", **({"seed": 1} | changes))
 
 
 def test_images_may_be_larger_than_the_models_buffer():

@@ -82,12 +82,12 @@ def test_a_flipped_byte_is_noticed_or_without_effect(tmp_path):
     archive.write_archive(path, [("numbers", numbers)], compressed=False)
     content = path.read_bytes()
     num_refused = 0
-    for place in range(0, len(content)):
+    for place in range(len(content)):
         damaged = bytearray(content)
         damaged[place] ^= 0x10
         path.write_bytes(bytes(damaged))
         try:
-            found = archive.read_archive(path, max_bytes={"numbers": 1000})["numbers"]
+            found = read(path)
         except ValueError:
             num_refused += 1
         else:

@@ -1,11 +1,13 @@
 """Locks, also on file systems that have none."""
 
+import concurrent.futures
 import errno
 import fcntl
 import json
 import os
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
@@ -18,12 +20,15 @@ from jaxil.files.locking import InUseError, is_locked, locked
 def lock(request, tmp_path, monkeypatch):
     """A path, where flock works or says that it cannot."""
     if request.param is not None:
-
-        def refuse(*_):
-            raise OSError(request.param, os.strerror(request.param))
-
-        monkeypatch.setattr(fcntl, "flock", refuse)
+        _refuse_locks(monkeypatch, request.param)
     return tmp_path / "lock"
+
+
+def _refuse_locks(monkeypatch, code=errno.ENOLCK):
+    def refuse(*_):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
 
 
 def test_one_holds_it_at_a_time(lock):
@@ -39,19 +44,9 @@ def test_one_holds_it_at_a_time(lock):
 
 
 def test_another_fault_of_the_lock_is_passed_on(tmp_path, monkeypatch):
-    def fail(*_):
-        raise OSError(errno.EIO, "input/output error")
-
-    monkeypatch.setattr(fcntl, "flock", fail)
-    with pytest.raises(OSError, match="input/output"), locked(tmp_path / "lock"):
+    _refuse_locks(monkeypatch, errno.EIO)
+    with pytest.raises(OSError, match="Input/output"), locked(tmp_path / "lock"):
         pass
-
-
-def _without_locks(monkeypatch):
-    def refuse(*_):
-        raise OSError(errno.ENOLCK, "no locks available")
-
-    monkeypatch.setattr(fcntl, "flock", refuse)
 
 
 HOLD = """
@@ -59,7 +54,6 @@ import errno, fcntl, pathlib, sys
 def refuse(*_):
     raise OSError(errno.ENOLCK, "no locks available")
 fcntl.flock = refuse
-from jaxil.files import locking
 from jaxil.files.locking import locked
 with locked(pathlib.Path(sys.argv[1])):
     print("held", flush=True)
@@ -70,7 +64,7 @@ with locked(pathlib.Path(sys.argv[1])):
 @pytest.fixture
 def left(tmp_path, monkeypatch):
     """A lock whose owner was killed, on a file system without locks."""
-    _without_locks(monkeypatch)
+    _refuse_locks(monkeypatch)
     path = tmp_path / "lock"
     with subprocess.Popen(
         [sys.executable, "-c", HOLD, str(path)],
@@ -99,6 +93,38 @@ def test_an_owner_that_was_killed_is_replaced_at_once(left):
     assert not left.with_name("lock.owner").exists()
 
 
+def test_of_several_that_find_an_owner_dead_one_replaces_it(left):
+    content = left.with_name("lock.owner").read_text()
+    everyone = threading.Barrier(8)
+
+    def hold() -> int:
+        everyone.wait(60)
+        try:
+            with locked(left):
+                everyone.wait(60)
+        except InUseError:
+            everyone.wait(60)
+            return 0
+        return 1
+
+    with concurrent.futures.ThreadPoolExecutor(everyone.parties) as threads:
+        for _ in range(30):
+            left.with_name("lock.owner").write_text(content)
+            holding = [threads.submit(hold) for _ in range(everyone.parties)]
+            assert sum(each.result(60) for each in holding) == 1
+
+
+def test_a_claim_that_was_killed_counts_for_ten_minutes(tmp_path, monkeypatch):
+    _refuse_locks(monkeypatch)
+    claim = tmp_path / "lock.owner.claim"
+    claim.touch()
+    with pytest.raises(InUseError, match="another process"), locked(tmp_path / "lock"):
+        pass
+    os.utime(claim, (0, 0))
+    with locked(tmp_path / "lock"):
+        assert not claim.exists()
+
+
 def test_another_process_with_the_owner_s_number_is_not_the_owner(left):
     _change_owner(left, 3, os.getpid())
     assert not is_locked(left)
@@ -116,7 +142,7 @@ def test_an_owner_elsewhere_lives_as_long_as_it_touches_its_file(left, place):
 
 
 def test_an_owner_touches_its_file(tmp_path, monkeypatch):
-    _without_locks(monkeypatch)
+    _refuse_locks(monkeypatch)
     monkeypatch.setattr(locking, "_HEARTBEAT_SECONDS", 0.01)
     owner = tmp_path / "lock.owner"
     with locked(tmp_path / "lock"):
@@ -142,7 +168,7 @@ def test_an_owner_touches_its_file(tmp_path, monkeypatch):
 def test_another_host_s_owner_is_named_with_the_way_out(
     tmp_path, monkeypatch, content, said
 ):
-    _without_locks(monkeypatch)
+    _refuse_locks(monkeypatch)
     (tmp_path / "lock.owner").write_text(content)
     with pytest.raises(InUseError, match=said) as caught, locked(tmp_path / "lock"):
         pass

@@ -38,6 +38,12 @@ def misbehave(how):
             pass
     if how == "waits for ever":
         time.sleep(100)
+    if how == "sends byte by byte":
+        code = " ".join(sys.orig_argv)
+        handle = int(code.partition("child.serve(")[2].partition(")")[0])
+        while True:
+            os.write(handle, b"1")
+            time.sleep(0.2)
     if how == "fills the memory":
         yield len(bytearray(2**30))
     if how == "sends too much":
@@ -84,6 +90,7 @@ def test_a_child_ends_with_its_last_reader():
         ("exits", "death", "exit status 3"),
         ("computes for ever", "timeout", "computed for 1 s"),
         ("waits for ever", "timeout", "within 5.0 s"),
+        ("sends byte by byte", "timeout", "within 5.0 s"),
         ("fills the memory", "MemoryError", "MemoryError"),
         ("sends too much", "death", "invalid result"),
         ("sends objects", "death", "invalid result|exit status 1"),
@@ -92,7 +99,7 @@ def test_a_child_ends_with_its_last_reader():
 def test_faults_of_the_child_are_named(how, kind, text, monkeypatch):
     monkeypatch.setattr("jaxil.machine.child._EXIT_SECONDS", 0.1)
     limits = LIMITS | {"cpu_seconds": 1, "result_bytes": 10**6}
-    if how == "waits for ever":
+    if kind == "timeout" and how != "computes for ever":
         limits["seconds"] = 5.0
     child = results(misbehave, how, **limits)
     next(child)
