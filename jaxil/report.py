@@ -4,9 +4,9 @@ r"""Turns folders of runs into one page with figures, tables and videos.
 
 RUNS are folders; every folder with a config.json in or below them is a run, finished or
 not. Writes report/index.html, which needs no network, report/figures (PNG and SVG) and
-report/tables (CSV). Seeds are averaged with 90 % confidence intervals; runs with other
-settings are kept apart. An older report there is replaced. With --watch=SECONDS it is
-written again and again, and the page in a browser follows, until Ctrl-C.
+report/tables (CSV). Seeds are averaged with 90 % confidence intervals; runs with
+different settings are kept apart. An older report there is replaced. --watch=SECONDS
+rewrites it until Ctrl-C, and a browser that shows the page reloads it.
 """
 
 import contextlib
@@ -20,6 +20,7 @@ from jaxil import command
 from jaxil.errors import UsageError
 
 _MAX_SEEDS = 10_000
+_FLAGS = ("output", "seeds", "videos", "watch", "runs", "trust")  # all take a value
 
 
 def main(argv: list[str]) -> None:
@@ -33,7 +34,7 @@ def main(argv: list[str]) -> None:
         f"there is no folder {str(root)!r}" for root in roots if not root.is_dir()
     ]
     if not roots:
-        faults.append("name the folders of runs: python -m jaxil.report RUNS...")
+        faults.append("name the folders of runs: jaxil report RUNS...")
     if not values.output:
         faults.append("--output is empty: name a new folder")
     else:
@@ -63,9 +64,11 @@ def _write(
             )
     if not found:
         names = ", ".join(map(str, roots))
-        rule = f"no run can be read in or below {names}: a run is a folder written by "
-        rule += "`python -m jaxil.launch`, with a config.json"
-        raise UsageError([*unreadable, rule])
+        fault = (
+            f"no run can be read in or below {names}: a run is a folder written by "
+            "`jaxil train`, with a config.json"
+        )
+        raise UsageError([*unreadable, fault])
     for sentence in unreadable:
         print(sentence, file=sys.stderr)
     print(f"{len(found)} runs; plotting", file=sys.stderr, flush=True)
@@ -93,14 +96,7 @@ def _named_runs(argv: list[str]) -> list[str]:
     named, takes_value = argv[:1], False
     for word in argv[1:]:
         if word.startswith("-"):
-            takes_value = word.lstrip("-") in (
-                "output",
-                "seeds",
-                "videos",
-                "watch",
-                "runs",
-                "trust",
-            )
+            takes_value = word.lstrip("-") in _FLAGS
             named.append(word)
         else:
             named.append(word if takes_value else f"--runs={word}")
@@ -140,7 +136,7 @@ def _define(values: flags.FlagValues) -> None:
     flags.DEFINE_integer(
         "watch",
         None,
-        "seconds until the report is written again, over and over; Ctrl-C ends it",
+        "seconds between rewrites of the report, which go on until Ctrl-C",
         lower_bound=1,
         upper_bound=86_400,
         flag_values=values,

@@ -1,17 +1,18 @@
-"""The benchmark: every part of a run has its time, and wrong use is refused at once."""
+"""The benchmark: every part of a run is timed, and wrong use is refused at once."""
 
 import contextlib
 import json
+import os
 
 import jax
 import pytest
 
-from jaxil import benchmark
+from jaxil import benchmark, command
 from jaxil import config as jaxil_config
 from jaxil.errors import UsageError
 from jaxil.timing import measurement, start, tables
 from jaxil.timing.bench import Bench
-from tests.commands import call, small
+from tests.commands import STATES, call, small
 
 _CONFIG = "--config=configs/tiny.py:pdac,ball_in_cup_catch"
 # What others read: these names stay.
@@ -71,7 +72,7 @@ def test_sizes_are_those_of_the_small_run(measured):
     assert results["replay_gb"] == pytest.approx(1010 * 24 * 24 * 3 / 1e9)
 
 
-def test_arithmetic_has_the_encoder_s_convolutions(measured):
+def test_arithmetic_counts_the_encoders_convolutions(measured):
     _, results = measured
     # Layers of 6 x 6 x 32 and 4 x 4 x 32, for 24 images; two operations each. The
     # gradients for 8 of them, without the pixels' own, are on top.
@@ -94,7 +95,7 @@ def test_the_config_is_the_one_that_was_asked_for(measured):
     assert results["reward_percent"] == pytest.approx(100 * rewards / (loop + rewards))
 
 
-def test_the_older_file_is_compared_and_told_apart(measured):
+def test_an_older_file_is_compared_and_its_differences_named(measured):
     finished, results = measured
     table = finished.stdout.split("new/old")[1]
     # The one number that the older file has.
@@ -166,7 +167,7 @@ def test_a_full_replay_is_full(tmp_path):
         (["--steps=1"], ["steps"]),
     ],
 )
-def test_wrong_use_is_told_before_anything_is_measured(flags, expected, monkeypatch):
+def test_wrong_use_is_reported_before_measuring(flags, expected, monkeypatch):
     monkeypatch.setattr(measurement, "measure", lambda *_, **__: pytest.fail("ran"))
     with pytest.raises(UsageError) as caught:
         benchmark.main(["benchmark", _CONFIG, *small("pdac"), *flags])
@@ -188,6 +189,15 @@ def test_a_start_that_fails_is_reported(monkeypatch):
     assert start.first_step_seconds(config, {}, messages.append) is None
     assert "start not measured" in messages[0]
     assert "broken" in messages[0]
+
+
+def test_a_method_that_only_plays_when_evaluated_starts_with_that():
+    messages = []
+    words = ["--config=tiny:bc,cartpole_swingup", *STATES, *small("bc")]
+    config = command.read_config([*words, "--config.total_frames=1000000000"])
+    seconds = start.first_step_seconds(config, os.environ, messages.append)
+    assert seconds is not None, messages
+    assert seconds > 0
 
 
 def test_compiling_cold_uses_no_cache(monkeypatch):

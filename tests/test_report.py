@@ -91,7 +91,7 @@ def test_final_returns(folder):
     assert row["mean_low"] == row["iqm_low"] == ""
 
 
-def test_tasks_are_taken_together_in_shares_of_their_experts(folder):
+def test_tasks_are_aggregated_in_shares_of_their_experts(folder):
     (row,) = rows(folder, "all_tasks")[None, "P-SIL"]
     # 300 and 600 of 1000 on cartpole, 300 of 1000 on walker.
     assert numbers(row, "tasks", "runs") == [2, 3]
@@ -146,7 +146,7 @@ def test_figures_are_written_twice(folder):
     assert any(name.startswith("episode1_") for name in written)
 
 
-def test_what_is_missing_of_the_papers_figures(folder):
+def test_what_the_papers_figures_lack(folder):
     text = (folder / "index.html").read_text()
     # Of 8 tasks, 5 methods and 4 seeds: 3 + 2 on cartpole; 1 + 0 on walker, where the
     # two that differ in batch size have the same seed.
@@ -158,7 +158,7 @@ def test_what_is_missing_of_the_papers_figures(folder):
     )
 
 
-def test_what_can_not_be_shown_is_said(folder):
+def test_what_cannot_be_shown_is_reported(folder):
     text = (folder / "index.html").read_text()
     for words in ("it is not a whole MP4", "config.json is damaged", "no eval.csv"):
         assert words in text
@@ -222,7 +222,7 @@ def test_the_page_in_a_browser(folder, browser, width, scheme):
     context.close()
 
 
-def test_the_page_moves(folder, browser):
+def test_columns_sort_and_a_line_follows_the_video(folder, browser):
     page = browser.new_page()
     page.goto((folder / "index.html").as_uri())
     unfold(page)
@@ -235,7 +235,7 @@ def test_the_page_moves(folder, browser):
     for order in (1, -1):
         page.click(f"{table} th:nth-child(5)")
         assert means() == sorted(means())[::order]
-    # The line over the rewards stands where the video is.
+    # The line across the rewards is at the video's time.
     page.wait_for_function("document.querySelector('video').readyState >= 2")
     share = page.evaluate(
         """new Promise((resolve) => {

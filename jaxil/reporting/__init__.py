@@ -1,1 +1,1 @@
-"""From folders of runs to one page: what `python -m jaxil.report` is made of."""
+"""From folders of runs to one page: what `jaxil report` is made of."""

@@ -27,8 +27,8 @@ def write_report(
       output: new folder; an older report there is replaced.
       unreadable: sentences about runs that cannot be read.
       num_seeds: how many seeds each variant should have; None if unknown.
-      num_videos: how many of each variant to show.
-      reload_seconds: after which browsers read the page again; None for never.
+      num_videos: how many videos of each variant to show.
+      reload_seconds: how often browsers reload the page; None for never.
 
     Raises:
       OSError: it cannot be written.
@@ -44,7 +44,7 @@ def write_report(
         groups, name="wasserstein", over="frame", column="wasserstein_to_expert"
     )
     finals = [f for f in map(measures.final, groups) if f is not None]
-    films, left_out = episodes.collect(groups, num_videos)
+    filmed, left_out = episodes.collect(groups, num_videos)
     sheets = {
         "by_frames": by_frames,
         "by_hours": by_hours,
@@ -52,7 +52,7 @@ def write_report(
         "distance": distance,
         "logits": charts.logit_sheet(groups, name="logits"),
     }
-    letters = tables.settings_table(groups)
+    settings = tables.settings_table(groups)
     on_page = [
         tables.final_table(finals),
         tables.aggregate_table(finals),
@@ -74,21 +74,21 @@ def write_report(
             "reload_seconds": reload_seconds,
             "shared": _shared(groups),
             "legend": {group.label: group.look for group in groups if group.measured},
-            "letters": letters,
+            "settings": settings,
             **sheets,
             "paper": paper_figures,
-            "episodes": films,
+            "episodes": filmed,
             "tables": on_page,
             "remarks": sentences,
         }
     )
-    plotted = [*sheets.values(), *(film.sheet for film in films)]
+    plotted = [*sheets.values(), *(episode.sheet for episode in filmed)]
     plotted += [figure.sheet for figure in paper_figures]
     with folders.replaced(output) as folder:
         for sheet in plotted:
             if sheet is not None:
                 write(sheet, folder / "figures")
-        for table in (letters, *on_page, *as_files):
+        for table in (settings, *on_page, *as_files):
             if table.rows:
                 path = folder / "tables" / f"{table.name}.csv"
                 path.write_bytes(tables.to_csv(table))
@@ -96,7 +96,7 @@ def write_report(
 
 
 def _facts(groups: Sequence[Group], num_remarks: int) -> list[tuple[str, str]]:
-    """Returns the numbers at the head of the page, with what they count."""
+    """Returns the numbers at the top of the page, with what they count."""
     runs = [run for group in groups for run in group.runs]
     frames = sum(run.frames for run in runs)
     return [

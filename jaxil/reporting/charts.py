@@ -1,4 +1,4 @@
-"""The figures of any runs: learning curves, last returns, logits; one panel a task."""
+"""Figures with a panel for each task: learning curves, last returns, logits."""
 
 import functools
 from collections.abc import Sequence
@@ -18,24 +18,24 @@ def curve_sheet(
     """Plots one line for each group.
 
     Args:
-      groups: those to show.
+      groups: to show.
       name: of the files.
       over: "frame" or "hours".
       column: of eval.csv.
 
     Returns:
-      None if no group has such a column; and the curves.
+      The sheet, or None if no group has such a column; and the curves.
     """
     panels, found = [], []
-    for task, some in tasks_of(groups).items():
-        lines = [measures.curve(group, over, column) for group in some]
+    for task, task_groups in tasks_of(groups).items():
+        lines = [measures.curve(group, over, column) for group in task_groups]
         shown = [line for line in lines if line is not None]
         if not shown:
             continue
         found += shown
         if column == _RETURN:
             label = "task return"
-            levels = [(v, f"expert {v:.0f}") for v, _ in expert_returns(some)]
+            levels = [(v, f"expert {v:.0f}") for v, _ in expert_returns(task_groups)]
         else:
             label, levels = "distance to the expert", [(1.0, "random policy")]
         draw = functools.partial(
@@ -58,11 +58,11 @@ def bar_sheet(finals: Sequence[Final], *, name: str) -> Sheet | None:
     panels = [
         Panel(
             task,
-            functools.partial(plots.bars, finals=some),
-            plots.bars_height(len(some)),
+            functools.partial(plots.bars, finals=task_finals),
+            plots.bars_height(len(task_finals)),
             plots.BAR_MARGINS,
         )
-        for task, some in tasks.items()
+        for task, task_finals in tasks.items()
     ]
     caption = (
         "Mean over seeds of the last evaluation's mean return, its 90 % confidence "
@@ -75,9 +75,9 @@ def bar_sheet(finals: Sequence[Final], *, name: str) -> Sheet | None:
 def logit_sheet(groups: Sequence[Group], *, name: str) -> Sheet | None:
     """Plots the discriminators' logits over frames; None without any."""
     panels, shown = [], []
-    for task, some in tasks_of(groups).items():
+    for task, task_groups in tasks_of(groups).items():
         pairs = []
-        for group in some:
+        for group in task_groups:
             expert, agent = (
                 measures.curve(group, "frame", column, table="training")
                 for column in _LOGITS

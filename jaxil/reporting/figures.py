@@ -23,8 +23,6 @@ TASKS = (  # in the paper's order
 )
 # The paper's hard tasks have 5 million frames in its main results, fewer in ablations.
 ABLATION_FRAMES = 3_000_000
-NUM_SEEDS = 10
-_MISSING = "is not installed here"
 
 DEMONSTRATIONS = "demonstrations.num_episodes"
 _DEMONSTRATIONS_VARIATION = Variation(DEMONSTRATIONS, 10, "{} demonstrations")
@@ -57,9 +55,9 @@ class Variant(NamedTuple):
 
     def _words(self) -> Iterator[str]:
         for variation in _variations(self.method):
-            value = self.overrides.get(variation.field)
             if variation.field not in self.overrides:
                 continue
+            value = self.overrides[variation.field]
             is_single = variation.field == DEMONSTRATIONS and value == 1
             yield "1 demonstration" if is_single else variation.words.format(value)
 
@@ -103,9 +101,8 @@ def _product(names: str, *changes: Mapping[str, Any]) -> tuple[Variant, ...]:
 
 
 _NOT_ALIGNED = {"sinkhorn.alignment": "time"}
-_DEMONSTRATIONS = _product(
-    "pdac psil bc", {DEMONSTRATIONS: 1}, {}, {DEMONSTRATIONS: 50}
-)
+_NUMBERS = ({DEMONSTRATIONS: 1}, {}, {DEMONSTRATIONS: 50})
+_DEMONSTRATIONS = _product("pdac psil bc", *_NUMBERS)
 _AUGMENTATION = _product("pdac psil bc", {}, {"shift_padding": 0})
 _DISTANCES = _product(
     "psil", {}, _NOT_ALIGNED, {**_NOT_ALIGNED, "sinkhorn.cost": "euclidean"}
@@ -144,34 +141,25 @@ def studies() -> dict[str, Study]:
         and method.uses_demonstrations
         and method.sees_actions is not True
     ]
-    numbers = ({DEMONSTRATIONS: 1}, {}, {DEMONSTRATIONS: 50})
     paper = {
         f"figure{number}": Study(figure.variants, figure.is_ablation)
         for number, figure in FIGURES.items()
     }
-    return {**paper, "video_alone": Study(_product(" ".join(alone), *numbers), True)}
+    return {**paper, "video_alone": Study(_product(" ".join(alone), *_NUMBERS), True)}
 
 
 def declaration(name: str) -> Method:
-    """Returns a method's declaration; of one that is not installed, its name only.
-
-    Names come from files of runs: nothing is imported that only they name.
-    """
-    if methods.is_trusted(name):
-        try:
-            return methods.get(name)
-        except UsageError:
-            pass
-    return Method(name=name, label=name, about=_MISSING)
+    """Returns a method's declaration; of one that is not installed, its name only."""
+    return _installed(name) or Method(name=name, label=name, about="not installed here")
 
 
 def is_installed(method: str) -> bool:
     """Returns whether a method's declaration can be read."""
-    return declaration(method).about != _MISSING
+    return _installed(method) is not None
 
 
 def variant_of(config: Mapping[str, Any]) -> Variant:
-    """Returns the variant that a run's config is.
+    """Returns the variant that a run's config makes.
 
     Args:
       config: nested, as `config.json` holds it. Fields that it lacks, because an
@@ -185,6 +173,16 @@ def variant_of(config: Mapping[str, Any]) -> Variant:
         if changed:
             overrides[field] = value
     return Variant(config["method"], overrides)
+
+
+def _installed(name: str) -> Method | None:
+    # Names come from files of runs: nothing is imported that only they name.
+    if not methods.is_trusted(name):
+        return None
+    try:
+        return methods.get(name)
+    except UsageError:
+        return None
 
 
 def _variations(method: str) -> list[Variation]:

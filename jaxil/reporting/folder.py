@@ -41,7 +41,8 @@ def problems(output: pathlib.Path) -> list[str]:
 def replaced(output: pathlib.Path) -> Iterator[pathlib.Path]:
     """Yields a new folder, and renames it to `output` at the end.
 
-    An exception leaves `output` unchanged; a kill may leave hidden folders beside it.
+    An exception leaves `output` unchanged. A kill may leave hidden folders beside it;
+    between the two renames, one of them is the old report.
 
     Raises:
       OSError: it cannot be written.

@@ -16,9 +16,9 @@ from jaxil.reporting.runs import Run, defaults_of
 
 _SAME_EXPERT = 1e-3  # relative; the renderer's rounding is far below
 _MAX_SHOWN = 60  # characters of one value
-_MAX_WORDS = 3  # of a label, beyond its method
-# Lines of one method: their dashes in line widths, marker, and lightness beside it.
-# Five and six have no common factor: thirty lines differ.
+_MAX_WORDS = 3  # of a label, after its method
+# How lines of one method differ: dashes in line widths, marker, and lightness added to
+# the method's own. Five and six have no common factor: thirty lines differ.
 _DASHES = ((), (4.0, 1.5), (1.0, 1.3), (5.0, 1.5, 1.0, 1.5), (7.0, 2.0), (2.5, 1.0))
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 _LIGHTNESS = (0.0, 0.17, -0.07, 0.25, 0.09)
@@ -53,8 +53,8 @@ class Group(NamedTuple):
       variant: the method with what an ablation changed.
       settings: those that differ from the paper's and from other runs of the same
         variant, on any task, such as "action_repeat 4".
-      label: the variant with its setting, or with a letter for more than three words;
-        the same on every task.
+      label: the variant with its settings, or with a letter in their place where that
+        takes more than three words; the same on every task.
       look: the same for all groups of this label.
       runs: by seed and folder, at least one.
     """
@@ -93,24 +93,26 @@ def make_groups(runs: Iterable[Run]) -> list[Group]:
                 if field in differing
             )
             found.setdefault((run.task, method, label, settings), []).append(run)
-    ordered = sorted(
-        found.items(),
-        key=lambda item: (
-            task_order(item[0][0]),
-            figures.declaration(item[0][1]).rank,
-            item[0][1],
-            len(item[1][0].variant.overrides),
-            [_by_number(text) for text in (item[0][2], *item[0][3])],
-        ),
-    )
-    labels = _labels(key[1:] for key, _ in ordered)
+
+    def order(key: tuple) -> tuple:
+        task, method, label, settings = key
+        return (
+            task_order(task),
+            figures.declaration(method).rank,
+            method,
+            len(found[key][0].variant.overrides),
+            [_by_number(text) for text in (label, *settings)],
+        )
+
+    ordered = sorted(found, key=order)
+    labels = _labels(key[1:] for key in ordered)
     looks = _looks((figures.declaration(key[0]).colour, k) for key, k in labels.items())
     groups = []
-    for (task, *key), members in ordered:
-        label = labels[tuple(key)]
-        in_order = tuple(sorted(members, key=lambda run: (run.seed, run.name)))
-        variant = in_order[0].variant
-        groups.append(Group(task, variant, key[2], label, looks[label], in_order))
+    for key in ordered:
+        members = tuple(sorted(found[key], key=lambda run: (run.seed, run.name)))
+        task, _, _, settings = key
+        label, variant = labels[key[1:]], members[0].variant
+        groups.append(Group(task, variant, settings, label, looks[label], members))
     return groups
 
 
@@ -136,7 +138,7 @@ def changes(run: Run) -> dict[str, Any]:
 
 
 def short(value: Any) -> str:
-    """Returns a setting's value in short, such as "5M" or "(1, 2)"."""
+    """Returns a setting's value in brief, such as "5M" or "(1, 2)"."""
     if isinstance(value, int) and not isinstance(value, bool):
         if value and value % 1000 == 0:
             return f"{value // 1000}k" if value % 1_000_000 else f"{value // 10**6}M"
@@ -151,7 +153,7 @@ def short(value: Any) -> str:
 
 
 def task_order(task: str) -> tuple[int, str]:
-    """Sorts tasks: the paper's, in its order, then others by name."""
+    """Returns a key that sorts the paper's tasks in its order, then others by name."""
     tasks = figures.TASKS
     return (tasks.index(task) if task in tasks else len(tasks), task)
 
@@ -233,6 +235,6 @@ def _shade(colour: str, change: float) -> str:
 
 
 def _by_number(text: str) -> list[tuple[int, float, str]]:
-    """Makes "10 demonstrations" come after "1 demonstration"."""
+    """Returns a key that sorts "10 demonstrations" after "2 demonstrations"."""
     parts = re.split(r"(\d+)", text)
     return [(1, float(p), "") if p.isdigit() else (0, 0.0, p) for p in parts]

@@ -10,7 +10,7 @@ from jaxil.reporting.runs import Run, Table
 from jaxil.reporting.statistics import Estimate
 
 LEVELS = (0.5, 0.8, 0.9)  # of the expert's return
-EARLY_FRAMES = 100_000  # what methods that learn from video alone are compared by
+EARLY_FRAMES = 100_000  # where methods that learn from video alone are compared
 _MAX_POINTS = 400  # of a curve; a figure's width shows no more
 
 

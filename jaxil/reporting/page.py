@@ -1,4 +1,4 @@
-"""The page: one file of HTML that needs no network. Its layout is page.html.jinja."""
+"""The page: one HTML file that needs no network, laid out by page.html.jinja."""
 
 import base64
 import itertools
@@ -19,7 +19,7 @@ def html(content: dict[str, Any]) -> bytes:
     Args:
       content: what the template names: heading, reload_seconds (or None), facts
         (numbers with what they count), shared (settings unlike the paper's), legend,
-        letters (a table), by_frames, by_hours, bars, distance and logits (sheets or
+        settings (a table), by_frames, by_hours, bars, distance and logits (sheets or
         None), paper (`PaperFigure`s), episodes, tables and remarks.
     """
     environment = jinja2.Environment(
@@ -29,7 +29,6 @@ def html(content: dict[str, Any]) -> bytes:
         trim_blocks=True,
     )
     prefixes = (f"s{number}" for number in itertools.count())
-
     captions: set[str] = set()
 
     def svg(panel: Panel, columns: int) -> Markup:

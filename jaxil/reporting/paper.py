@@ -15,7 +15,7 @@ class PaperFigure(NamedTuple):
       figure: which.
       sheet: the plots; None without two methods or variants to compare.
       lacks: what is missing; empty if nothing is.
-      command: trains it.
+      command: trains the missing runs.
     """
 
     figure: Figure
@@ -29,7 +29,8 @@ def paper_figures(groups: list[Group], num_seeds: int | None) -> list[PaperFigur
 
     Args:
       groups: of all runs; those with other settings than the paper's are plotted, too.
-      num_seeds: how many each line should have; None asks for one run of each figure.
+      num_seeds: how many each line should have; None if unknown: then a figure lacks
+        nothing once it can be plotted.
     """
     return [_figure(groups, each, num_seeds) for each in figures.FIGURES.values()]
 
@@ -40,10 +41,10 @@ def _figure(groups: list[Group], figure: Figure, num_seeds: int | None) -> Paper
         for group in groups
         if group.task in figures.TASKS and group.variant in figure.variants
     ]
-    labels = {group.variant.label for group in own if group.measured}
+    variants = [group.variant for group in own if group.measured]
     # An ablation needs more than plain methods.
-    is_shown = len(labels) > 1 and (
-        not figure.is_ablation or any(group.variant.overrides for group in own)
+    is_shown = len({variant.label for variant in variants}) > 1 and (
+        not figure.is_ablation or any(variant.overrides for variant in variants)
     )
     sheet = _sheet(figure, own) if is_shown else None
     command = f"jaxil sweep --ablation=figure{figure.number}"

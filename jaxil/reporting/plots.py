@@ -7,19 +7,19 @@ import numpy as np
 
 from jaxil.reporting.measures import Curve, Final
 
-# Stands for the page's text colour, which is light on dark pages.
+# Becomes the page's text colour, which is light on dark pages.
 INK = "#1b1c1e"
-_DOTTED = 40  # points; a line with fewer shows each of them
-_BAR_LINES = 2.8  # of text, that a bar takes with its label
+_MAX_MARKED = 40  # points; a longer curve has no markers
+_BAR_LINES = 2.8  # height of a bar with its label, in lines of text
 _LINE_HEIGHT = 0.145  # inches
 # Left and right of the axes, in inches.
 BAR_MARGINS, REWARD_MARGINS = (0.1, 0.2), (0.72, 0.62)
-# Beyond this many times the height of the means, an interval is cut off.
+# Intervals are cut off beyond this many times the height of the means.
 _BAND_ROOM = 1.25
-_NAME_ROOM = 0.07  # of the axis, for the name of a dashed line
-# Of an alignment: moments of the agent that have lines, the height of a film strip, and
-# the widths of the lightest and the heaviest line.
-_MATCHED, _STRIP, _LINE_WIDTHS = 60, 0.27, (0.25, 2.5)
+_NAME_ROOM = 0.07  # share of the axis for the name of a dashed line
+# Of an alignment: the most lines, the height of a film strip as a share of the axes,
+# and the widths of lines for the shares 0 and 1.
+_MAX_MATCHES, _STRIP, _LINE_WIDTHS = 60, 0.27, (0.25, 2.5)
 
 
 def curves(
@@ -35,7 +35,7 @@ def curves(
     Args:
       axes: Matplotlib's.
       lines: at least one.
-      levels: heights to mark with a dashed line, and their names; falling.
+      levels: heights to mark with a dashed line, and their names; highest first.
       over: "frame" or "hours".
       name: of the vertical axis.
     """
@@ -49,7 +49,7 @@ def curves(
     for value, text in levels:
         axes.axhline(value, color=INK, ls=(0, (4, 3)), lw=0.9, alpha=0.75, zorder=1)
         if named - value < _NAME_ROOM * (top - bottom):
-            continue  # it would cover the name of the one above
+            continue  # its name would cover the one above
         named = value
         axes.annotate(
             text,
@@ -198,14 +198,14 @@ def alignment(
 ) -> None:
     """Plots a transport plan as lines between two film strips.
 
-    Each of some moments of the agent has a line to the expert's that most of it goes
-    to, as wide as that share, in a colour that tells its time.
+    Each of evenly spaced agent frames has a line to the expert frame that receives
+    most of its mass; the width shows that share, the colour the agent's time.
 
     Args:
       axes: Matplotlib's.
       weights: at least 0. Shape [T + 1, N + 1].
       agent_strip: evenly spaced frames from first to last, uint8 [n, H, W, 3].
-      expert_strip: the same of the expert.
+      expert_strip: the same for the expert.
       step_seconds: of an agent step; None if unknown.
     """
     from matplotlib import colormaps
@@ -221,7 +221,7 @@ def alignment(
         extent = (0, end, low, low + _STRIP)
         axes.imshow(np.concatenate([*strip], axis=1), extent=extent, aspect="auto")
     lines, widths, colours = [], [], []
-    rows = np.linspace(0, len(shares) - 1, min(_MATCHED, len(shares))).round()
+    rows = np.linspace(0, len(shares) - 1, min(_MAX_MATCHES, len(shares))).round()
     for row in rows.astype(int):
         column = int(shares[row].argmax())
         lines.append([(step * row, 1.0 - _STRIP), (step * column, _STRIP)])
@@ -237,25 +237,25 @@ def alignment(
 
 
 def _shares(weights: np.ndarray) -> np.ndarray:
-    """Returns what part of each agent frame's mass goes where: rows with sum 1."""
+    """Returns the share of each agent frame's mass that goes where: rows sum to 1."""
     return weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
 
 
 def _time(step_seconds: float | None) -> tuple[float, str]:
-    """Returns the length of a step on an axis, and how the axis is named."""
+    """Returns the length of a step on a time axis, and the end of the axis's name."""
     return (step_seconds, ", seconds") if step_seconds else (1.0, " step")
 
 
 def _line(axes: Any, line: Curve) -> None:
     look = line.group.look
-    marker = look.marker if len(line.x) <= _DOTTED else None
+    marker = look.marker if len(line.x) <= _MAX_MARKED else None
     mean, low, high = line.mean
     whole = line.count == line.num_runs
     axes.fill_between(line.x, low, high, color=look.colour, alpha=0.17, lw=0)
     style = {"color": look.colour, "ls": look.line, "marker": marker, "ms": 2.8}
     axes.plot(line.x, np.where(whole, mean, np.nan), lw=1.7, zorder=3, **style)
-    # Faint where seeds have ended, since the mean jumps as they leave; up to the next
-    # points of the other line, so that both meet.
+    # Faint where seeds are missing, since the mean jumps as they drop out; drawn up to
+    # the next points of the full line, so that both meet.
     beside = np.convolve(~whole, [1, 1, 1])[1:-1] > 0
     if beside.any():
         faint = np.where(beside, mean, np.nan)

@@ -15,11 +15,11 @@ from jaxil.files import tables, untrusted
 from jaxil.files.settings import as_stored, flat
 from jaxil.reporting import figures
 
-# Large folders of a run, in which there are no other runs.
+# Large folders of a run; they hold no other runs.
 _OWN_FOLDERS = ("checkpoints", "replay", "tensorboard", "videos", "wandb")
 _RETURN = "task_return_mean"
 _FAILED = "failed.json"  # of `jaxil sweep`
-# What every run writes; without it a file is damaged.
+# What every run writes; a config without it is damaged.
 _NEEDED = {"method": str, "task": str, "seed": int, "total_frames": int}
 # Beyond any true setting, return or time; sums of larger ones would overflow.
 LARGEST = 1e15
@@ -30,11 +30,11 @@ Table = Mapping[str, np.ndarray]
 
 
 class UnreadableError(Exception):
-    """A config.json that does not belong to a run; the message says why."""
+    """A config.json that is damaged or of no run; continues a sentence about it."""
 
 
 class Run(NamedTuple):
-    """One run as its folder shows it.
+    """One run, as read from its folder.
 
     Attributes:
       folder: where it is.
@@ -149,10 +149,10 @@ def read(folder: pathlib.Path) -> Run:
         config |= flat(own)
     if (folder / _FAILED).exists():
         remarks.append(f"failed, {_exit_status(folder)}; see its log")
-    evaluation = _read_table(folder / "eval.csv", _RETURN, remarks)
+    evaluation = _read_table(folder / "eval.csv", ("frame", _RETURN), remarks)
     if not len(evaluation[_RETURN]) and not any("eval.csv" in r for r in remarks):
         remarks.append("no evaluation yet")
-    training = _read_table(folder / "train.csv", None, remarks)
+    training = _read_table(folder / "train.csv", ("frame",), remarks)
     return Run(
         folder=folder,
         name=printable(folder),
@@ -169,13 +169,13 @@ def read(folder: pathlib.Path) -> Run:
 def defaults_of(method: str, task: str) -> dict[str, Any]:
     """Returns the paper's settings for a method and task, by dotted name.
 
-    Of a method that is not installed only the settings that all methods have.
+    For a method that is not installed, only the settings that all methods have.
     """
-    stand_in = method if figures.is_installed(method) else next(iter(methods.known()))
-    names = jaxil_config.fields(stand_in)
-    if stand_in != method:
-        names = jaxil_config.FIELDS
-    config = jaxil_config.default_config(stand_in, task)
+    if figures.is_installed(method):
+        known, names = method, jaxil_config.fields(method)
+    else:
+        known, names = next(iter(methods.known())), jaxil_config.FIELDS
+    config = jaxil_config.default_config(known, task)
     values = {name: jaxil_config.read(config, name) for name in names}
     return as_stored({**values, "method": method})
 
@@ -201,10 +201,11 @@ def _read_config(path: pathlib.Path) -> dict[str, Any]:
         raise UnreadableError('has no "config" with settings in it')
     for field, kind in _NEEDED.items():
         value = config.get(field)
-        is_text = isinstance(value, str)
         if not isinstance(value, kind) or isinstance(value, bool):
             raise UnreadableError(f"has no {field} ({_shown(value)})")
-        if is_text and not (value.isprintable() and 0 < len(value) <= _MAX_REASON):
+        if isinstance(value, str) and not (
+            value.isprintable() and 0 < len(value) <= _MAX_REASON
+        ):
             raise UnreadableError(f"has a damaged {field} ({_shown(value)})")
     return stored
 
@@ -223,15 +224,15 @@ def _setting(nested: Mapping[str, Any], field: str, default: Any) -> Any:
     value: Any = nested
     for part in field.split("."):
         if not isinstance(value, Mapping):
-            raise UnreadableError(f"{field} must be in a group of settings")
+            raise UnreadableError(f"has a value in place of the section of {field}")
         if part not in value:
             return default  # an older jaxil wrote the file
         value = value[part]
     if _kind(value) != _kind(default):
-        rule = f"must be of the kind of {default!r}"
-        raise UnreadableError(f"{field}={_shown(value)} {rule}")
+        rule = f"expected a value such as {default!r}"
+        raise UnreadableError(f"has {field}={_shown(value)}; {rule}")
     if _kind(value) is float and not abs(value) <= LARGEST:
-        raise UnreadableError(f"{field}={_shown(value)} is beyond any true value")
+        raise UnreadableError(f"has {field}={_shown(value)}, beyond any true value")
     return value
 
 
@@ -245,10 +246,12 @@ def _shown(value: Any) -> str:
 
 
 def _read_table(
-    path: pathlib.Path, needed: str | None, remarks: list[str]
+    path: pathlib.Path, columns: tuple[str, ...], remarks: list[str]
 ) -> dict[str, np.ndarray]:
-    """Reads eval.csv or train.csv; adds to `remarks` why that fails."""
-    columns = ["frame", *([needed] if needed else [])]
+    """Reads a table, and keeps the rows with numbers in `columns`, "frame" among them.
+
+    Adds to `remarks` what is wrong with it.
+    """
     empty = {column: np.zeros(0) for column in columns}
     try:
         table = tables.read_csv(path)
@@ -270,7 +273,7 @@ def _read_table(
     good = np.all([np.isfinite(table[column]) for column in columns], axis=0)
     if not good.all():
         remarks.append(f"{path.name}: {int((~good).sum())} rows without a number")
-    # The last row of a frame counts: a resumed run wrote it again.
+    # Of several rows of one frame the last counts: a resumed run wrote it again.
     frames = table["frame"][good]
     _, backwards = np.unique(frames[::-1], return_index=True)
     order = len(frames) - 1 - backwards

@@ -12,13 +12,14 @@ from jaxil.reporting.plots import INK
 # In inches. Positions are computed, since Matplotlib's layout engines take twice as
 # long as everything else.
 _WIDTH, _HEIGHT = 4.3, 2.85  # of a panel in three columns
-_FEWER_WIDTH = 10.0  # of all panels in fewer columns, which fill the same width
+_FEWER_WIDTH = 10.0  # of all panels in a row of fewer
 _FEWER_HEIGHT = 3.6
 _MARGINS = (0.64, 0.14)  # left and right of the axes
-_TOP, _TITLE, _BOTTOM = 0.12, 0.24, 0.46  # above and below them
+_TOP, _BOTTOM = 0.12, 0.46  # above and below them
+_TITLE = 0.24
 _LEGEND_LINE = 0.19
 _COLUMNS = 3
-_LEGEND_WIDTH = 42  # characters; with a longer label, one below the other
+_LEGEND_WIDTH = 42  # characters; a longer label puts all labels into one column
 _SETTINGS: dict[Any, Any] = {
     "font.family": ["DejaVu Sans"],  # comes with Matplotlib
     "font.size": 8.5,
@@ -61,7 +62,7 @@ class Sheet(NamedTuple):
     Attributes:
       name: of its files.
       panels: at least one.
-      legend: labels with their looks; empty where panels say it themselves.
+      legend: labels with their looks; empty where the panels name their groups.
       caption: a sentence or two.
     """
 
@@ -118,11 +119,11 @@ def _figure(
     legend: Sequence[tuple[str, Look]] = (),
     *,
     title: float,
-    beside: int = _COLUMNS,
+    beside: int,
 ) -> tuple[Any, list[Any]]:
-    """Returns a figure with axes for each panel, and its legend.
+    """Returns a figure with its legend, and the axes of each panel.
 
-    `beside` is how many panels there are beside each other, at most.
+    `title` is the height of a panel's title; `beside` how many panels share a row.
     """
     # Not pyplot: a separate Figure needs no display and leaves no global state.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -169,7 +170,7 @@ def _figure(
 
 def _saved(figure: Any, kind: str, *, transparent: bool = False) -> bytes:
     stream = io.BytesIO()
-    # No date and no version: the same runs give the same bytes.
+    # Without date and version, the same runs give the same bytes.
     metadata = {"svg": {"Date": None, "Creator": None}, "png": {"Software": None}}
     figure.savefig(
         stream, format=kind, metadata=metadata[kind], transparent=transparent

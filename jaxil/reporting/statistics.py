@@ -1,4 +1,4 @@
-"""What several seeds say together: means, intervals, and when a level is reached."""
+"""Statistics over seeds: means, intervals, and when a level is reached."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -87,7 +87,7 @@ def join_curves(
 
     Returns:
       All x that any seed has, rising, [X]; and each seed's y there, [S, X], linear
-      between its own points and NaN outside of them: nothing is extrapolated.
+      between its own points and NaN beyond them: nothing is extrapolated.
     """
     x = np.unique(np.concatenate([x for x, _ in curves]))
     rows = [np.interp(x, own, y, left=np.nan, right=np.nan) for own, y in curves]
@@ -122,14 +122,13 @@ def mean_until(x: np.ndarray, y: np.ndarray, end: float) -> float:
     return float(np.trapezoid(heights, np.append(x_inside, end)) / end)
 
 
-def median_until(times: Sequence[float]) -> float:
+def median_arrival(times: Sequence[float]) -> float:
     """Returns the median time, where NaN, for never, counts as later than all.
 
-    Returns:
-      NaN where too few arrived for the median to exist.
+    NaN where too few arrived for the median to exist.
     """
     if not len(times):
         return float("nan")
-    # Of an even number the later of the middle two: half of the seeds are there then.
+    # Of an even number, the later of the middle two: by then half have arrived.
     middle = np.sort(np.nan_to_num(times, nan=np.inf))[len(times) // 2]
     return float(middle) if np.isfinite(middle) else float("nan")

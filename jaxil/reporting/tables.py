@@ -21,7 +21,7 @@ from jaxil.reporting.statistics import Estimate
 
 _NAN = float("nan")
 _PERCENTS = [f"{level * 100:.0f}" for level in LEVELS]
-# Columns of numbers with their formats on the page, and titles that are not the name.
+# Columns of numbers by their format on the page, and titles that differ from the name.
 _COUNTS = ["runs", "tasks", "finished", "unfinished", "empty", "seed", "frames"]
 _COUNTS += [f"frames_{percent}" for percent in _PERCENTS]
 _RETURNS = ["mean", "mean_low", "mean_high", "iqm", "iqm_low", "iqm_high", "median"]
@@ -195,7 +195,7 @@ def efficiency_table(groups: Sequence[Group]) -> Table:
             reached = np.isfinite([each[k] for each in frames]).mean()
             row[f"reached_{percent}"] = reached if has_expert else _NAN
             for unit, times in (("frames", frames), ("hours", hours)):
-                median = statistics.median_until([each[k] for each in times])
+                median = statistics.median_arrival([each[k] for each in times])
                 row[f"{unit}_{percent}"] = median
         early = np.array([early_share(run) for run in runs])
         early = early[np.isfinite(early)]
@@ -220,7 +220,7 @@ def seed_table(groups: Sequence[Group], num_seeds: int | None) -> Table:
 
     Args:
       groups: of all runs.
-      num_seeds: lists which of seeds 0 to num_seeds - 1 are missing; None: does not.
+      num_seeds: adds which of seeds 0 to num_seeds - 1 are missing; None: does not.
     """
     rows = []
     for group in groups:

@@ -17,7 +17,7 @@ from jaxil.training import agent as agents
 from jaxil.training import assembly
 from jaxil.training.parts import make_parts
 
-_EPISODE_STEPS = 500  # of tasks without a limit
+_EPISODE_STEPS = 500  # of tasks without a time limit
 _RENDERED_FRAMES = 20  # of the random episode; rendering 500 would take too long
 
 
@@ -71,11 +71,11 @@ class Bench:
         self.add_episode()
         self.batches = self.sample()
         # A run may dispatch several updates at once.
-        self._several = config.updates_per_dispatch
+        self._num_updates = config.updates_per_dispatch
         dispatched: Any = self.batches
-        if self._several > 1:
-            stack = [dispatched] * self._several
-            dispatched = jax.tree.map(lambda *leaves: np.stack(leaves), *stack)
+        if self._num_updates > 1:
+            copies = [self.batches] * self._num_updates
+            dispatched = jax.tree.map(lambda *leaves: np.stack(leaves), *copies)
         self._on_device = jax.device_put(dispatched)
         begin = time.perf_counter()
         jax.block_until_ready(self.update())
@@ -93,7 +93,7 @@ class Bench:
             "render_ms": (self._environment.render, 1),
             "act_ms": (lambda: run.act(self.observation[None]), 1),
             "sample_ms": (self.sample, 1),
-            "update_ms": (self.update, self._several),
+            "update_ms": (self.update, self._num_updates),
             "reward_ms": (lambda: run.reward(self.episode), 1),
         }
 
@@ -102,9 +102,9 @@ class Bench:
         return self.run.updates.sample(self._rng)
 
     def update(self) -> Any:
-        """Dispatches updates like a run; returns the new state."""
+        """Dispatches as many updates as a run does at once; returns the new state."""
         run, agent = self.run, self.run.agent
-        step = agent.repeated_step if self._several > 1 else agent.update_step
+        step = agent.repeated_step if self._num_updates > 1 else agent.update_step
         run.state, run.counters.metrics = step(
             run.state, *self._on_device, run.updates.frames()
         )
@@ -143,7 +143,7 @@ class Bench:
         return run.frame - first_frame, seconds, working
 
     def lower(self, *, convolutions: str | None = None) -> Any:
-        """Traces and lowers one update, if given with other `convolutions`."""
+        """Traces and lowers one update, optionally with other `convolutions`."""
         run, agent = self.run, self.run.agent
         if convolutions is not None:
             config = self.config.copy_and_resolve_references()

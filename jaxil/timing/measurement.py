@@ -54,8 +54,9 @@ def measure(
         results: dict[str, Any] = {"ranges": {}}
         for name, (function, num_calls) in bench.parts().items():
             times = 10 * repeats if name in _SHORT_PARTS else repeats
-            timing = [1e3 * each / num_calls for each in timed(function, times)]
-            results[name], *results["ranges"][name] = timing
+            timing = timed(function, times)
+            median, *ends = (1e3 * each / num_calls for each in timing)
+            results[name], results["ranges"][name] = median, ends
         results |= _time_loop(bench, steps)
         if full:
             bench.fill_replay()

@@ -12,6 +12,7 @@ from typing import Any
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
+from jaxil import methods
 from jaxil.config import Config
 
 _TIMEOUT_SECONDS = 600.0  # it takes 20 s on two busy cores
@@ -48,6 +49,8 @@ def first_step_seconds(
     """
     settings = config.to_dict()
     settings["num_environments"] = 1  # so that this process steps it
+    if not methods.get(config.method).plays:  # only its evaluation does
+        settings["total_frames"] = config.update_every_steps * config.action_repeat
     with tempfile.TemporaryDirectory() as folder:
         file = pathlib.Path(folder, "config.py")
         file.write_text(_CONFIG_FILE.format(json.dumps(settings)))

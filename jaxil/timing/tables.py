@@ -22,7 +22,7 @@ ROWS: dict[str, dict[str, str]] = {
     "before the first step": {
         "compile_seconds": "the first update of this process, caches as they were",
         "compile_cold_seconds": "tracing and compiling the update, nothing cached",
-        "start_seconds": "from `jaxil.launch` to the first step, caches warm",
+        "start_seconds": "from `jaxil train` to the first step, caches warm",
     },
     "the loop": {
         "frames_per_second": "acting and learning, nothing else",
@@ -93,16 +93,16 @@ def read(path: str) -> dict[str, Any]:
         results = json.loads(read_regular(path))
         if not all(isinstance(results[name], kind) for name, kind in _ALWAYS.items()):
             raise ValueError("its values are of other types")
-    except (OSError, ValueError, LookupError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise UsageError(
-            f"--compare={path} is not a file that `python -m jaxil.benchmark "
-            f"--json=FILE` wrote without --sweep ({error}); name one that is"
+            f"--compare={path} is not a file that `jaxil benchmark --json=FILE` wrote "
+            f"without --sweep ({error}); name one that is"
         ) from error
     return results
 
 
 def comparison_table(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    """Returns a table of old, new and new / old for each row that both have."""
+    """Returns a table of old, new and their ratio for each row that both have."""
     lines = [f"{'':<28}{'old':>10}{'new':>10}{'new/old':>10}"]
     for name in (name for rows in ROWS.values() for name in rows):
         before, now = old.get(name), new.get(name)

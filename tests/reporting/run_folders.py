@@ -35,11 +35,11 @@ def write_run(
     """Writes config.json, eval.csv and train.csv.
 
     Args:
-      folder: made.
+      folder: a new one.
       method, task, seed: of the run.
       returns: of each evaluation, by its frame; a frame takes 3.6 seconds, so that
         1000 frames take an hour. None for a run that has not begun.
-      expert: its return; "" for none.
+      expert: mean return of its demonstrations; "" without any.
       total_frames: of the config.
       changes: further settings by their dotted names.
       logits: whether train.csv has those of a discriminator.
@@ -82,7 +82,7 @@ def film(folder: pathlib.Path, frame: int, *, plan: bool) -> None:
         "task_rewards": np.linspace(0, 1, 29, dtype=np.float32),
     }
     if plan:
-        # Two columns of padding, as runs of before wrote them.
+        # Two columns of padding, as older runs wrote them.
         arrays["plan"] = np.eye(30, 28, dtype=np.float32) / 30
         arrays["step_seconds"] = np.asarray(0.1)
         arrays["agent_strip"] = arrays["expert_strip"] = frames[::3]

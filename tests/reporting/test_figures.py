@@ -4,7 +4,9 @@ import pytest
 
 from jaxil import config as jaxil_config
 from jaxil import methods, outside
+from jaxil.reporting import groups, paper, runs
 from jaxil.reporting.figures import FIGURES, Variant, variant_of
+from tests.reporting.run_folders import write_run
 
 EVERY = sorted(
     {variant.slug: variant for f in FIGURES.values() for variant in f.variants}.items()
@@ -66,7 +68,25 @@ def test_names_by_hand():
     assert variant_of(config.to_dict()) == Variant("drqv2", {})
 
 
-def test_configs_of_before_a_field_existed_have_its_default():
+def test_configs_older_than_a_field_have_its_default():
     config = jaxil_config.default_config("psil", "walker_walk").to_dict()
     del config["sinkhorn"]["cost"], config["sinkhorn"]["alignment"]
     assert variant_of(config) == Variant("psil", {})
+
+
+def test_an_ablation_is_plotted_once_a_changed_run_has_an_evaluation(tmp_path):
+    write_run(tmp_path / "pdac", "pdac", "walker_walk", 0, {1000: 1})
+    write_run(tmp_path / "psil", "psil", "walker_walk", 0, {1000: 1})
+    changes = {"shift_padding": 0}
+    folder = write_run(
+        tmp_path / "changed", "pdac", "walker_walk", 0, None, changes=changes
+    )
+
+    def plotted():
+        made = groups.make_groups(map(runs.read, runs.find([tmp_path])))
+        shown = paper.paper_figures(made, None)
+        return [each.figure.number for each in shown if each.sheet is not None]
+
+    assert plotted() == [2, 3, 4]
+    (folder / "eval.csv").write_bytes((tmp_path / "pdac" / "eval.csv").read_bytes())
+    assert plotted() == [2, 3, 4, 6, 10]

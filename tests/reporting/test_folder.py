@@ -93,7 +93,7 @@ def test_a_link_stays_a_link(tmp_path):
 @pytest.mark.parametrize(
     "stranger", ["notes.txt", "figures/photo.jpg", "tables/more/x.csv", "config.json"]
 )
-def test_what_no_report_has_written_is_not_replaced(tmp_path, stranger):
+def test_files_that_no_report_wrote_are_not_replaced(tmp_path, stranger):
     write(tmp_path / "report", "old")
     path = tmp_path / "report" / stranger
     path.parent.mkdir(exist_ok=True)
@@ -102,7 +102,7 @@ def test_what_no_report_has_written_is_not_replaced(tmp_path, stranger):
     assert stranger.rsplit("/x", 1)[0] in problem
 
 
-def test_a_page_of_others_is_not_replaced(tmp_path):
+def test_a_page_that_is_no_report_is_not_replaced(tmp_path):
     (tmp_path / "index.html").write_text("<p>my page</p>")
     (problem,) = folder.problems(tmp_path)
     assert "index.html" in problem

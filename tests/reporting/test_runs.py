@@ -1,4 +1,4 @@
-"""Runs are read however little of them there is, and grouped by what they are."""
+"""Runs are read even if incomplete or damaged, and grouped by their settings."""
 
 import json
 import os
@@ -6,8 +6,8 @@ import os
 import numpy as np
 import pytest
 
-from jaxil.reporting import groups, measures, remarks, runs, tables
-from tests.reporting.run_folders import EVAL_HEADER, many_runs, write_run
+from jaxil.reporting import episodes, groups, measures, remarks, runs, tables
+from tests.reporting.run_folders import EVAL_HEADER, film, many_runs, write_run
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def test_states(found):
     assert state("cut_off") == "unfinished: frame 2,000 of 3,000"
 
 
-def test_what_is_missing_is_said(found):
+def test_missing_and_damaged_files_are_reported(found):
     def remarks(name):
         return found[f"walker_walk/{name}"].remarks
 
@@ -108,7 +108,7 @@ def test_a_damaged_table_is_named_and_the_run_kept(tmp_path, text, expected):
         ({"demonstrations": {"num_episodes": "ten"}}, "num_episodes"),
     ],
 )
-def test_a_config_of_something_else_is_refused(tmp_path, change, expected):
+def test_a_damaged_config_is_refused(tmp_path, change, expected):
     folder = write_run(tmp_path / "run", "pdac", "walker_walk", 0, None)
     stored = json.loads((folder / "config.json").read_text())
     stored["config"].update(change)
@@ -148,6 +148,24 @@ def test_pipes_are_refused_not_waited_for(tmp_path):
         runs.read(folder)
 
 
+@pytest.mark.parametrize("seconds", [np.nan, -1.0, None])
+def test_a_video_is_shown_without_what_is_damaged_beside_it(tmp_path, seconds):
+    folder = write_run(tmp_path / "run", "psil", "walker_walk", 0, {1000: 1})
+    film(folder, 1000, plan=True)
+    path = folder / "videos" / "frame_000001000.npz"
+    path.unlink()
+    if seconds is None:
+        os.mkfifo(path)
+        expected = "is left out: it cannot be read (not a regular file)"
+    else:
+        np.savez(path, imitation_rewards=np.ones(3), step_seconds=np.asarray(seconds))
+        expected = "it has an array step_seconds that is no duration"
+    made = groups.make_groups([runs.read(folder)])
+    ((episode,), (sentence,)) = episodes.collect(made, 1)
+    assert episode.sheet is None
+    assert sentence.endswith(expected)
+
+
 def test_fields_of_an_older_config_have_defaults_or_are_ignored(tmp_path):
     old = write_run(tmp_path / "old", "pdac", "walker_walk", 0, {1000: 1})
     stored = json.loads((old / "config.json").read_text())
@@ -160,7 +178,7 @@ def test_fields_of_an_older_config_have_defaults_or_are_ignored(tmp_path):
     assert [run.seed for run in group.runs] == [0, 1]
 
 
-def test_groups_are_seeds_of_one_thing_in_the_papers_order(found):
+def test_groups_are_seeds_with_equal_settings_in_the_papers_order(found):
     made = groups.make_groups(run for run in found.values() if not isinstance(run, str))
     named = [(group.task, group.label, len(group.runs)) for group in made]
     assert named == [
@@ -249,7 +267,7 @@ def test_a_run_whose_method_is_not_installed_is_shown(tmp_path):
     ]
 
 
-def test_what_a_reader_should_know_is_said(found):
+def test_unusual_runs_and_limited_comparisons_are_reported(found):
     read = [run for run in found.values() if not isinstance(run, str)]
     made = groups.make_groups(read)
     text = "\n".join(remarks.remarks(made))

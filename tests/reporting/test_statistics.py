@@ -115,4 +115,4 @@ def test_mean_until_by_hand():
     ],
 )
 def test_seeds_that_never_arrive_are_later_than_all(times, expected):
-    np.testing.assert_equal(statistics.median_until(times), float(expected))
+    np.testing.assert_equal(statistics.median_arrival(times), float(expected))

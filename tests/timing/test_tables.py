@@ -1,4 +1,4 @@
-"""Which files can be compared, what is compared, and what is said to differ."""
+"""Comparing results: which files can be, which rows are, and which settings differ."""
 
 import json
 
@@ -51,6 +51,7 @@ def test_other_devices_and_fields_are_named():
         ('{"update_ms": 3, "device": "cpu"}', "'config'"),
         ('{"update_ms": "fast", "device": "cpu", "config": {}}', "other types"),
         (b"\xff\xfe\x00", "decode"),
+        ("[" * 200_000, "recursion"),
         (None, "No such file or directory"),
     ],
 )
