@@ -19,7 +19,8 @@ from jaxil.replay.stacking import gather_stacks
 def memory_bytes(*, action_dim: int, **sizes) -> int:
     """Returns the size of a full replay; see `frames_bytes` for `sizes`."""
     slots = ring_slots(sizes["capacity_steps"], sizes["episode_steps"])
-    return frames_bytes(**sizes) + slots * 4 * (action_dim + 2)
+    slot_bytes = 4 * (action_dim + 2)  # float32: action, reward, discount
+    return frames_bytes(**sizes) + slots * slot_bytes
 
 
 def frames_bytes(
@@ -29,7 +30,7 @@ def frames_bytes(
     observation_shape: tuple[int, ...],
     observation_dtype,
 ) -> int:
-    """Returns the size of its frames and thus of a device copy; see `EpisodeRing`."""
+    """Returns the size of a replay's frames, on the host or on the device."""
     frame_bytes = math.prod(observation_shape) * np.dtype(observation_dtype).itemsize
     return ring_slots(capacity_steps, episode_steps) * frame_bytes
 

@@ -103,17 +103,15 @@ class EpisodeRing:
 
         Raises:
           ValueError: for a wrong shape or dtype, a number that is not finite, or an
-            episode that is longer than the replay, which is unchanged then.
+            episode that is longer than the replay, which is then unchanged.
         """
         like = Episode(self._frames, self._actions, self._rewards, self._discounts)
         frames, actions, rewards, discounts = checked_episode(
             frames, actions, rewards, discounts, like=like
         )
         num_steps, length = len(rewards), len(self._frames)
-        fits = num_steps <= self._capacity_steps and num_steps < length
-        require(
-            fits, "episode length", num_steps, f"at most {self._capacity_steps} steps"
-        )
+        rule = f"at most {self._capacity_steps} steps"
+        require(num_steps <= self._capacity_steps, "episode length", num_steps, rule)
 
         while (
             self._num_steps_stored + num_steps > self._capacity_steps

@@ -5,10 +5,9 @@ import os
 
 import numpy as np
 
-# Interleaving is bound by memory: blocks stay in a core's cache, and other threads only
-# help beyond the second number.
+# Interleaving is bound by memory: a block stays in a core's cache.
 _BLOCK_BYTES = 2**21
-_PARALLEL_BYTES = 2**22
+_PARALLEL_BYTES = 2**22  # more threads help beyond this size only
 _THREADS = concurrent.futures.ThreadPoolExecutor(
     min(4, os.cpu_count() or 1), thread_name_prefix="stacking"
 )

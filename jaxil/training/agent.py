@@ -64,12 +64,12 @@ class Agent(NamedTuple):
 
 
 def stack_size(config: Config) -> int:
-    """Returns the frames in an observation: state vectors are not stacked."""
+    """Returns the number of frames in an observation; states are not stacked."""
     return config.frame_stack if config.observation == "pixels" else 1
 
 
 def exploration_schedule(config: Config) -> optax.Schedule:
-    """Returns the noise's standard deviation by agent step."""
+    """Returns the standard deviation of the exploration noise, by agent step."""
     return optax.linear_schedule(
         config.exploration_std_start,
         config.exploration_std_end,
@@ -78,7 +78,7 @@ def exploration_schedule(config: Config) -> optax.Schedule:
 
 
 def exploration_by_update(config: Config) -> optax.Schedule:
-    """Returns that deviation by update number, for the actions drawn in updates."""
+    """Returns the same by update number, for the actions drawn in updates."""
     schedule = exploration_schedule(config)
     first = config.seed_frames // config.action_repeat
     every, at_once = config.update_every_steps, config.updates_per_step
@@ -86,7 +86,7 @@ def exploration_by_update(config: Config) -> optax.Schedule:
 
 
 def learning_rate(config: Config) -> optax.ScalarOrSchedule:
-    """Returns the learner's rate, by update number where it changes."""
+    """Returns the learning rate: constant, or a schedule by update number."""
     if not config.learning_rate_steps:
         return config.learning_rate
     share = config.updates_per_step / config.update_every_steps
@@ -154,8 +154,8 @@ def mean_image(
         return 0.5
     total = np.zeros(demonstrations.frames.shape[2:], np.float64)
     lengths = demonstrations.num_frames
+    # One episode at a time bounds the memory.
     for episode, length in zip(demonstrations.frames, lengths, strict=True):
-        # One at a time: bounded memory.
         total += episode[:length].sum(axis=0, dtype=np.float64)
     mean = (total / lengths.sum() / 255.0).astype(np.float32)
     return np.concatenate([mean] * config.frame_stack, axis=-1)
@@ -246,7 +246,7 @@ def make_agent(
         plan=None if rewarder.plan is None else jax.jit(rewarder.plan),
         rewarder=rewarder,
         mean_image=mean if isinstance(mean, np.ndarray) else None,
-        # Compiled, and kept in the cache: one by one, its 450 operations take longer.
+        # Compiled, and cached: dispatched one by one, its 450 operations take longer.
         init_state=jax.jit(init_state),
     )
 
@@ -265,8 +265,3 @@ def expert_episodes(
         jax.numpy.asarray(demonstrations.num_frames),
         jax.numpy.asarray(actions),
     )
-
-
-def abstract_state(agent: Agent) -> TrainState:
-    """Returns shapes and dtypes of the learner's state, for a checkpoint to fill."""
-    return jax.eval_shape(agent.init_state)

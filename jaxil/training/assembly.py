@@ -25,7 +25,7 @@ from jaxil.replay.replay import Replay
 from jaxil.training import loggers
 from jaxil.training.agent import native_fault, stack_size
 
-# Added to the seed for what must not share its random starts with training.
+# Added to the run's seed, so that evaluations do not start as training episodes do.
 EVALUATION_SEED = 1_000_003
 # With a fault in one of these, the demonstrations are not opened.
 _READING_FIELDS = {
@@ -129,7 +129,8 @@ def make_player(
     Args:
       config: checked.
       environment: the training environment; several are made like it.
-      first_episode: see `Player`, as for `open_episodes`.
+      first_episode: see `Player`.
+      open_episodes: see `Player`.
       timed: wraps the environments, to measure their time.
       say: prints a line.
     """
@@ -189,7 +190,7 @@ def load_demonstrations(config: Config) -> loading.Demonstrations | None:
 def load_shown_expert(
     config: Config, image_size: int, progress: Callable[[int, int], None] | None
 ) -> loading.Demonstrations:
-    """Returns the first demonstration, large enough for people.
+    """Returns the first demonstration, rendered for people to watch.
 
     Raises:
       DemonstrationError: the file does not fit this run.
@@ -238,7 +239,8 @@ def _file_settings(config: Config) -> dict[str, Any]:
 
 def make_replay(config: Config, environment: PixelEnvironment) -> Replay:
     """Returns an empty replay of the config's size."""
-    frame = environment.reset(episode=0) and environment.single_observation()
+    environment.reset(episode=0)
+    frame = environment.single_observation()
     return Replay(
         capacity_steps=config.replay_size_steps,
         episode_steps=environment.episode_steps or config.replay_size_steps,

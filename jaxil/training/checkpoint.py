@@ -64,7 +64,7 @@ class Checkpoints:
         self._last: pathlib.Path | None = None  # saved or restored by this process
         self._num_episodes_saved = 0
         self._checksums: dict[int, int] = {}  # of episodes' files, where known
-        self._oldest_episode: dict[pathlib.Path, int] = {}  # that a checkpoint needs
+        self._oldest_episode: dict[pathlib.Path, int] = {}  # needed by each
 
     def newest(self) -> int | None:
         """Returns the environment frame of the newest checkpoint, or None."""
@@ -83,12 +83,12 @@ class Checkpoints:
 
         Args:
           frame: environment frames so far.
-          learner_state: pytree of arrays, numbers, typed PRNG keys and None.
-          counters: what else the run needs to resume, as JSON can hold it (whole
-            numbers of any size included); tuples come back as lists.
+          learner_state: pytree of arrays, typed PRNG keys and None.
+          counters: what else the run needs to resume, as JSON: integers of any size
+            are kept, tuples come back as lists.
           replay: only read.
-          mean_image: that the encoder subtracts, where it is not a constant: without
-            it a policy could not be used without the demonstrations.
+          mean_image: what the encoder subtracts, unless that is a constant. Saved so
+            that a policy can be used without the demonstrations.
 
         Raises:
           CheckpointError: if the folder has checkpoints and none was restored.
@@ -148,16 +148,14 @@ class Checkpoints:
         needed = min(self._oldest_episode.get(path, 0) for path in kept)
         episode_files.remove_except(self._replay, needed, added)
 
-    def restore(
-        self, abstract_learner_state: Any, replay: Replay | None = None
-    ) -> tuple[Any, dict]:
+    def restore(self, abstract_learner_state: Any, replay: Replay) -> tuple[Any, dict]:
         """Reads the newest checkpoint, or the one before it if that is damaged.
 
         Damaged episodes are left out of the replay and reported.
 
         Args:
-          abstract_learner_state: pytree of the same structure; its leaves (arrays, or
-            what jax.eval_shape returns) say shapes, dtypes and types.
+          abstract_learner_state: pytree of the same structure with the shapes and
+            dtypes of its leaves, from jax.eval_shape.
           replay: emptied, then filled with the checkpoint's episodes.
 
         Returns:
@@ -170,13 +168,12 @@ class Checkpoints:
         path, record, learner_state = self._read(
             functools.partial(learner_files.as_state, abstract_learner_state)
         )
-        if replay is not None:
-            self._refill(replay, record, path / f"{_REWARDS}.npy")
+        self._refill(replay, record, path / f"{_REWARDS}.npy")
         self._remember(path, record)
         return learner_state, record["counters"]
 
     def read_policy(self) -> tuple[dict[str, Any], np.ndarray | None, dict]:
-        """Reads what it takes to act, as `restore` does.
+        """Reads what it takes to act, from the same checkpoint as `restore`.
 
         Returns:
           The parameters of encoder, actor and critic by these names; the mean image
@@ -271,7 +268,7 @@ class Checkpoints:
         return sorted((path for path in paths if _order(path)), key=_order)
 
     def _free_path(self, frame: int) -> pathlib.Path:
-        # There may be one of this frame: after a save, a request to stop, and another.
+        # A resumed run that first plays an evaluation it owes saves this frame again.
         path, again = self._checkpoints / f"frame_{frame:012d}", 0
         while path.exists():
             again += 1

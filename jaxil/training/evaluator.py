@@ -95,7 +95,7 @@ class Evaluator:
                 distance = self._distance.relative_distance(evaluation.episodes)
             if films:
                 filmed = self.explain(state, evaluation.episodes[0])
-                # 256 pixels take as long as one or two episodes that the agent sees.
+                # Rendering this large takes as long as playing one or two episodes.
                 sides = film.sides(
                     config,
                     self.environment,

@@ -36,7 +36,7 @@ _FEATURE_DIM, _STATE_DIM = 50, 256
 # the cost matrix is [640, 640] at most.
 _MOMENTS, _MAX_EPISODES = 64, 10
 _LAYERS = ((3, 2), (3, 1), (3, 1), (3, 1))  # kernel and stride, as DrQ-v2's
-# Stored with a random policy's distance, which is not reused if this has changed.
+# Stored with a random policy's distance, which is measured again if this has changed.
 _DEFINITION = "debiased Sinkhorn divergence of 64 moments an episode"
 
 
@@ -104,18 +104,21 @@ class ExpertDistance:
             first_episode=0,
         )
         environment.close()
-        # Not zero, which it may be where the expert acts at random too.
+        # It may be zero where the expert acts at random too.
         distance = max(self._distance(played.episodes), 1e-12)
-        content = {"distance": distance, "task_return_mean": played.mean}
-        content |= {"definition": _DEFINITION}
-        content |= {"checksum": _checksum(content)}
+        content = {
+            "distance": distance,
+            "task_return_mean": played.mean,
+            "definition": _DEFINITION,
+        }
+        content["checksum"] = _checksum(content)
         with writes_to(self._path.parent):
             write_atomically(self._path, json.dumps(content, indent=2).encode())
         return distance
 
 
 def make_random_embedding(frame_shape: tuple[int, ...], frame_stack: int) -> Any:
-    """Returns frames of an episode, uint8 [T, H, W, 3] -> features [64, D].
+    """Returns a function: frames of an episode [T, *frame_shape] -> features [64, 50].
 
     Args:
       frame_shape: (H, W, 3), or (S,) for state vectors. Small images get as many

@@ -1,4 +1,4 @@
-"""One episode of a learned policy beside the expert's, large enough for people."""
+"""Films for people to watch: an episode of a policy beside the expert's."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -18,8 +18,8 @@ from jaxil.machine import progress, screen
 from jaxil.training import assembly
 
 SIZE = 256  # pixels of a side, unless another is asked for
-_VIEW_SHARE = 0.3  # of a side, for what the agent itself sees
-_FRAME = 1  # pixels around it
+_VIEW_SHARE = 0.3  # of a side, for the inset with what the agent sees
+_BORDER = 1  # pixels around the inset
 
 
 class Side(NamedTuple):
@@ -27,7 +27,7 @@ class Side(NamedTuple):
 
     Attributes:
       frames: uint8 [T + 1, H, W, 3].
-      captions: whose it is, time and rewards so far, for each frame.
+      captions: of each frame: whose episode, time, return so far, newest reward.
     """
 
     frames: np.ndarray
@@ -35,10 +35,10 @@ class Side(NamedTuple):
 
 
 def recorder(environment: PixelEnvironment, image_size: int) -> Callable[[], Any]:
-    """Returns what an evaluation calls at each moment of the episode to be filmed.
+    """Returns the function that an evaluation calls at each moment of a filmed episode.
 
-    Simulator states are rendered later, in another simulator. A task without them is
-    rendered at once.
+    It notes the simulator's state, which is rendered later in another simulator. A task
+    without such states is rendered at once.
     """
     sees_pixels = len(environment.observation_spec().shape) == 3
 
@@ -62,17 +62,17 @@ def sides(
     shows_progress: bool = False,
     stop_asked: Callable[[], bool] = lambda: False,
 ) -> list[Side]:
-    """Returns the agent's episode and the expert's first one, if it can be had.
+    """Returns the agent's episode and the expert's first one, if that is available.
 
     Args:
       config: of the run.
-      environment: what the evaluation was played in.
+      environment: that of the evaluation.
       evaluation: recorded by `recorder` with the same size.
       first_episode: number of the recorded episode.
       image_size: height and width of the images.
       imitation_rewards: of the recorded episode, [T]; None if unknown.
-      shows_progress: whether rendering has a progress line.
-      stop_asked: asked between images, which may take half a minute in all in software.
+      shows_progress: whether rendering shows a progress line.
+      stop_asked: asked between images; all take up to half a minute in software.
 
     Raises:
       Stopped: a stop was asked for.
@@ -150,9 +150,9 @@ def _captions(
 
 
 def _inset(frames: np.ndarray, views: tuple[np.ndarray, ...]) -> None:
-    """Puts what the agent sees into the corner of each frame."""
+    """Puts what the agent sees into the lower right corner of each frame."""
     side = round(_VIEW_SHARE * frames.shape[1])
     for frame, view in zip(frames, views, strict=True):
         resized = Image.fromarray(view).resize((side, side), Image.Resampling.NEAREST)
-        frame[-side - _FRAME :, -side - _FRAME :] = 255
+        frame[-side - _BORDER :, -side - _BORDER :] = 255
         frame[-side:, -side:] = np.asarray(resized)

@@ -39,9 +39,9 @@ def write(
 
     Args:
       folder: absolute.
-      learner_state: pytree of arrays, numbers, typed PRNG keys and None.
+      learner_state: pytree of arrays, typed PRNG keys and None.
       record: anything that JSON can hold.
-      arrays: others, each for a file NAME.npy.
+      arrays: further arrays by name, each written to a file NAME.npy.
 
     Raises:
       OSError: if a file cannot be written.
@@ -56,7 +56,7 @@ def write(
             key_type = str(jax.random.key_impl(leaf))
             leaf = jax.random.key_data(leaf)
         array = np.asarray(leaf)
-        # orbax writes no empty arrays; the shape in the record says all of them.
+        # orbax writes no empty arrays; their shape in the record is enough.
         if array.size:
             stored[name] = array
         leaves[name] = {
@@ -87,7 +87,7 @@ def write(
 
 
 def read(folder: pathlib.Path) -> tuple[dict, dict[str, np.ndarray]]:
-    """Reads the record and the learner's arrays by name, those of keys as numbers.
+    """Reads the record, and the learner's arrays by name; PRNG keys as raw data.
 
     Raises:
       ValueError: a file is missing or has changed.
@@ -95,9 +95,9 @@ def read(folder: pathlib.Path) -> tuple[dict, dict[str, np.ndarray]]:
     import orbax.checkpoint as ocp
 
     try:
-        # Before orbax sees it: on a damaged file, orbax leaves tracebacks of its
-        # threads on the screen, and a change within an array passes unnoticed. Files
-        # that were not there then, such as a file manager's, do not matter.
+        # Before orbax sees them: on a damaged file, its threads print tracebacks, and
+        # a change within an array passes unnoticed. Files added since, such as a file
+        # manager's, do not matter.
         expected = json.loads(read_regular(folder / _CHECKSUMS))
         if not expected or _checksums(folder, expected) != expected:
             raise ValueError("its files have changed since they were written")
@@ -121,13 +121,13 @@ def as_state(abstract_state: Any, record: dict, arrays: dict[str, np.ndarray]) -
     """Returns the learner state that `write` was given.
 
     Args:
-      abstract_state: pytree of the same structure; its leaves (arrays, or what
-        jax.eval_shape returns) say shapes, dtypes and types.
+      abstract_state: pytree of the same structure with the shapes and dtypes of its
+        leaves, from jax.eval_shape.
       record: see `read`.
       arrays: see `read`.
 
     Raises:
-      OtherLearnerError: names, shapes or types differ.
+      OtherLearnerError: names, shapes or dtypes differ.
     """
     expected = dict(_named_leaves(abstract_state))
     faults = [f"{name} is missing" for name in expected if name not in arrays]
@@ -136,7 +136,7 @@ def as_state(abstract_state: Any, record: dict, arrays: dict[str, np.ndarray]) -
     for name, like in expected.items():
         if name in arrays:
             key_type = record["leaves"][name]["key_type"]
-            leaf = _as_leaf(arrays[name], key_type, like)
+            leaf = _as_leaf(arrays[name], key_type)
             if _kind(leaf) != _kind(like):
                 faults.append(f"{name} is {_kind(leaf)}, expected {_kind(like)}")
             leaves.append(leaf)
@@ -147,7 +147,7 @@ def as_state(abstract_state: Any, record: dict, arrays: dict[str, np.ndarray]) -
 
 
 def _require_room(folder: pathlib.Path, num_bytes: int) -> None:
-    """Raises OSError on a full disk, on which threads of orbax print tracebacks."""
+    """Raises OSError if the disk is full: orbax's threads would print tracebacks."""
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             os.posix_fallocate(file.fileno(), 0, num_bytes + _ROOM_BYTES)
@@ -164,11 +164,7 @@ def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
     ]
 
 
-def _as_leaf(array: np.ndarray, key_type: str | None, like: Any) -> Any:
-    if isinstance(like, bool | int | float):
-        return array.item()
-    if isinstance(like, np.ndarray | np.generic):
-        return array
+def _as_leaf(array: np.ndarray, key_type: str | None) -> jax.Array:
     if key_type is not None:
         return jax.random.wrap_key_data(jnp.asarray(array), impl=key_type)
     # A copy, because the learner donates its state: jax must own this memory.
@@ -176,8 +172,6 @@ def _as_leaf(array: np.ndarray, key_type: str | None, like: Any) -> Any:
 
 
 def _kind(leaf: Any) -> str:
-    if isinstance(leaf, bool | int | float):
-        return type(leaf).__name__
     return f"{leaf.dtype}{list(leaf.shape)}"
 
 

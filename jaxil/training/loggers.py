@@ -33,7 +33,7 @@ class Logger(Protocol):
 
         Args:
           group: "train", at each episode's end, or "eval".
-          frame: environment frames so far; never falls.
+          frame: environment frames so far; never decreases.
           values: by column of train.csv or eval.csv.
         """
         ...
@@ -104,7 +104,7 @@ class Tables:
 
 
 class TensorBoard:
-    """An events file; on a resume, TensorBoard drops what is after that frame."""
+    """An events file; TensorBoard drops what a resumed run is about to write again."""
 
     def __init__(
         self, workdir: pathlib.Path, config: dict[str, Any], resume_frame: int | None
@@ -193,7 +193,7 @@ class WeightsAndBiases:
 
 
 def _known(group: str, values: Mapping[str, float]) -> dict[str, float]:
-    """Returns GROUP/COLUMN by value, without metrics of which there are none yet."""
+    """Returns values by GROUP/COLUMN, without metrics that have no value yet."""
     return {
         f"{group}/{column}": float(value)
         for column, value in values.items()
@@ -203,7 +203,7 @@ def _known(group: str, values: Mapping[str, float]) -> dict[str, float]:
 
 @contextlib.contextmanager
 def _no_questions() -> Iterator[None]:
-    """Hides the terminal: W&B then fails where it would ask for a login."""
+    """Hides standard input: W&B then fails instead of asking for a login."""
     terminal = sys.stdin
     with pathlib.Path(os.devnull).open() as sys.stdin:
         try:

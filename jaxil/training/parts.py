@@ -6,6 +6,7 @@ import pathlib
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import numpy as np
 
 from jaxil.config import Config
@@ -111,7 +112,8 @@ def make_parts(
     counters, open_episodes = Counters(), {}
     resumed = checkpoints.newest() is not None
     if resumed:
-        state, saved = checkpoints.restore(agents.abstract_state(agent), replay)
+        abstract_state = jax.eval_shape(agent.init_state)
+        state, saved = checkpoints.restore(abstract_state, replay)
         open_episodes = {
             int(number): np.asarray(actions, np.float32)
             for number, actions in saved.pop("open_episodes", {}).items()

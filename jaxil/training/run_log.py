@@ -25,8 +25,8 @@ TRAIN_COLUMNS = (
     "task_return",  # undiscounted sum of task rewards, which the agent never sees
     "imitation_return",  # the same of the rewards that it learns from
     "length",  # agent steps
-    "frames_per_second",
-    "reward_seconds",
+    "frames_per_second",  # since the row before; in a process's first, since frame 0
+    "reward_seconds",  # spent on rewards so far, by this process
     # Diagnostics of the learner; those of the method follow.
     "critic/loss",
     "critic/value",
@@ -73,7 +73,7 @@ class Outputs:
           config: of the run.
           demonstrations: what the method imitates, or None.
           resume_frame: on a resume, rows of later frames are dropped.
-          owes_evaluation: whether the evaluation of that frame will be played again.
+          owes_evaluation: whether the evaluation at that frame will be played again.
 
         Raises:
           UsageError: the config's logger does not start.
@@ -235,14 +235,14 @@ class Outputs:
 
 
 def as_floats(metrics: Mapping[str, Any]) -> dict[str, float]:
-    """Reads metrics, which may wait on the device."""
+    """Returns metrics as numbers, fetched from the device."""
     return {name: float(value) for name, value in metrics.items()}
 
 
 def frames_per_second(num_images: int) -> float:
-    """Returns the speed at which an episode plays in ten seconds or less.
+    """Returns the frame rate at which an episode plays in ten seconds or less.
 
-    Suite episodes last 10 to 25 simulated seconds; one speed for all keeps the two
-    halves of a video together.
+    Suite episodes last 10 to 25 simulated seconds. Both halves of a video play at the
+    rate of the agent's, so they stay together.
     """
     return max(15.0, num_images / 10.0)

@@ -10,10 +10,10 @@ class Stopwatch:
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {"environment": 0.0, "update": 0.0}
-        self.reward_seconds = 0.0
+        self.reward_seconds = 0.0  # part of "update"
 
     def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Returns `function`, its time added to `name`."""
+        """Returns `function`, whose time is added to the activity `name`."""
 
         def call(*args: Any, **kwargs: Any) -> Any:
             start = time.perf_counter()
@@ -26,7 +26,7 @@ class Stopwatch:
 
 
 class TimedPool:
-    """A pool whose calls, waiting included, count as "environment"."""
+    """Environments whose calls, waiting included, count as "environment"."""
 
     def __init__(self, pool: Any, stopwatch: Stopwatch) -> None:
         self.size = pool.size

@@ -8,8 +8,10 @@ import jax
 import numpy as np
 
 from jaxil import config as jaxil_config
+from jaxil import outside
 from jaxil.config import Config
 from jaxil.demonstrations.states import DemonstrationError
+from jaxil.environments import tasks
 from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.errors import UsageError
 from jaxil.learner.policy import make_mean_action
@@ -30,7 +32,7 @@ class Policy:
       seconds: wall-clock time of training.
       observation_shape: (H, W, 3 * frame_stack), frames stacked oldest first, or (S,).
       observation_dtype: uint8 for pixels, float32 for states.
-      networks: the modules, and
+      networks: the agent's modules.
       params: their parameters.
     """
 
@@ -78,7 +80,13 @@ class Policy:
         return actions[0] if is_single else actions
 
     def make_environment(self, seed: int = 0) -> PixelEnvironment:
-        """Returns the task as the policy was trained on it."""
+        """Returns the task as the policy was trained on it.
+
+        Raises:
+          UsageError: the task is code that only the run's folder names.
+        """
+        if tasks.names_code(self.config.task):
+            outside.require_trusted(self.config.task, "task", "the run's folder")
         return assembly.environment_with_seed(self.config, seed)
 
     def description(self) -> str:
@@ -138,9 +146,9 @@ def load(folder: str | os.PathLike) -> Trained:
     """Returns the policy with an environment.
 
     Raises:
-      UsageError: see `load_policy`.
+      UsageError: see `load_policy`, or the task is code that only the folder names.
     """
-    workdir.read_config(pathlib.Path(folder))  # whose task is imported below
+    workdir.read_config(pathlib.Path(folder))  # refuses such code before it is imported
     policy = load_policy(folder)
     environment = assembly.evaluation_environment(policy.config)
     return Trained(policy.config, policy, environment)

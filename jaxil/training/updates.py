@@ -22,8 +22,8 @@ _REFRESH_EPISODES = 8  # in one call; bounds the memory on the device
 class Updates:
     """Samples a batch for each update that is due, and runs several at once.
 
-    With `replay_on_device`, frames are on the device and batches hold their indices;
-    without, batches are stacked on the host and sent whole. The samples are the same.
+    With `replay_on_device`, frames are on the device and batches hold their indices.
+    Otherwise batches are stacked on the host and sent whole. The samples are the same.
     """
 
     def __init__(
@@ -80,15 +80,15 @@ class Updates:
           state: donated.
 
         Returns:
-          The state after it, and metrics of the last update, None without any.
+          The state after them, and the last one's metrics; None if there were none.
         """
         pending, self._pending = self._pending, []
         frames, metrics = self.frames(), None
         if len(pending) > 1 and len(pending) == self._config.updates_per_dispatch:
             batches = jax.tree.map(lambda *leaves: np.stack(leaves), *pending)
             return self._agent.repeated_step(state, *batches, frames)
-        # An episode or the budget ended early. One by one, since a scan of another
-        # length would have to be compiled.
+        # One by one: a group of one, or one that the end of an episode or of the budget
+        # cut short. A scan of another length would have to be compiled.
         for batch, expert in pending:
             state, metrics = self._agent.update_step(state, batch, expert, frames)
         return state, metrics
@@ -139,7 +139,7 @@ class Updates:
         return np.asarray(rewards)
 
     def frames(self) -> Frames | None:
-        """Returns the frames that are on the device; None where none are.
+        """Returns the frames that are on the device; None if none are.
 
         An episode that enters the replay replaces them.
         """

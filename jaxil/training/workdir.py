@@ -19,7 +19,7 @@ from jaxil.files import locking, writing
 from jaxil.files.settings import as_stored, flat
 from jaxil.files.untrusted import read_regular
 
-# Its frame; a second number tells two checkpoints of one frame apart.
+# A checkpoint's name: its frame, and a number if there are several of that frame.
 CHECKPOINT = re.compile(r"frame_(\d{12,})(?:_(\d+))?")
 _SOURCE, _DIGEST = "demonstrations.source", "demonstrations_digest"
 # No file of a run takes longer between two writes.
@@ -35,7 +35,7 @@ def from_flag(value: str | None) -> pathlib.Path:
     """Returns the folder that `--workdir` names.
 
     Raises:
-      UsageError: it is missing or empty, or no name that a file can have.
+      UsageError: it is missing, empty, or not a name that a file can have.
     """
     if not value:
         raise UsageError(
@@ -61,10 +61,11 @@ def problems(workdir: pathlib.Path, config: Config) -> list[Fault]:
 
     Args:
       workdir: need not exist; it is not created.
-      config: must be that of the run that is in the folder already, if there is one.
+      config: must match the run that is already in the folder, if there is one.
     """
     parent = workdir
-    while not parent.exists():
+    # Not pathlib's, which raises in folders that it may not search.
+    while not os.path.exists(parent):
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         return [
@@ -75,7 +76,7 @@ def problems(workdir: pathlib.Path, config: Config) -> list[Fault]:
                 str(workdir),
             )
         ]
-    if not (workdir / "config.json").exists():
+    if not os.path.exists(workdir / "config.json"):
         return []
     try:
         before = read_config(workdir)
@@ -84,7 +85,7 @@ def problems(workdir: pathlib.Path, config: Config) -> list[Fault]:
     different = _differences(before, config)
     stored = _read_json(workdir / "config.json").get(_DIGEST)
     if stored is not None and jaxil_config.uses_demonstrations(config):
-        # The content decides, not its path.
+        # Their content decides, not their path.
         different = [each for each in different if not each.startswith(_SOURCE)]
         if demonstrations_digest(config) not in (stored, None):
             different.append(f"{_SOURCE}: its content has changed since")
@@ -162,14 +163,19 @@ def newest_checkpoint(workdir: pathlib.Path) -> int | None:
 
 
 def read_config(workdir: pathlib.Path, *, imports_task: bool = True) -> Config:
-    """Returns the config of the run in a folder, whoever wrote it.
+    """Returns the config of the run in a folder, which may be somebody else's.
 
     Fields that are newer than the run have their defaults, which are how older versions
     behaved. Fields that no longer exist are left out.
 
+    Args:
+      workdir: the folder.
+      imports_task: whether the task's code will be imported, so that the user must
+        have named it unless it is jaxil's.
+
     Raises:
-      UsageError: there is none, it cannot be read, or its method is neither installed
-        nor named by the user (see `methods.is_trusted`).
+      UsageError: there is no config, it cannot be read, or it names code that the user
+        has not (see `outside.require_trusted`).
     """
     path = workdir / "config.json"
     try:
@@ -180,7 +186,7 @@ def read_config(workdir: pathlib.Path, *, imports_task: bool = True) -> Config:
         if imports_task and tasks.names_code(task):
             outside.require_trusted(task, "task", path)
         config = default_config(method, task)
-        known = jaxil_config.fields(stored["method"])
+        known = jaxil_config.fields(method)
         there = flat(stored)
         for field in known.keys() & there.keys():
             group, _, leaf = field.rpartition(".")

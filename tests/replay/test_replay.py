@@ -136,7 +136,7 @@ def test_samples_are_windows_of_the_newest_episodes(
             np.testing.assert_allclose(batch.discount[item], discount, rtol=1e-6)
 
 
-def test_all_of_a_window_by_hand():
+def test_a_whole_window_by_hand():
     # Environment discounts 1, 1/2, 1; gamma 1/2: weights 1, 1/2, 1/8.
     replay = make_replay(
         observation_shape=(1,), observation_dtype=np.float32, frame_stack=1

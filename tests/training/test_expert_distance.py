@@ -1,4 +1,4 @@
-"""The distance to the expert: zero to oneself, one at random, alike for all runs."""
+"""The distance to the expert: zero for itself, one for random actions."""
 
 import types
 
@@ -120,14 +120,14 @@ def test_a_stored_distance_is_used_if_it_verifies(tmp_path, monkeypatch):
     assert len(played) == 7
 
 
-def test_what_fills_up_a_short_demonstration_does_not_count(tmp_path):
+def test_the_padding_of_a_short_demonstration_does_not_count(tmp_path):
     short = draw(1, 12)
-    filled = demonstrations(short)._replace(
+    padded = demonstrations(short)._replace(
         frames=np.concatenate([short, draw(2, 9)])[None]
     )
     agent = [episode(draw(3, 21))]
     distances = [
         expert_distance.ExpertDistance(small_config(), tmp_path, each)._distance(agent)
-        for each in (demonstrations(short), filled)
+        for each in (demonstrations(short), padded)
     ]
     assert distances[0] == distances[1]

@@ -1,4 +1,4 @@
-"""Whole runs that are killed, stopped and resumed, in every way of learning.
+"""Whole runs that are killed, stopped and resumed, with every kind of update.
 
 The environment is a drawing that moves with the actions, so that nothing is simulated.
 Most of the time goes into compiling: a minute of a core.
@@ -135,7 +135,7 @@ def make_run(folder, method="dac", **changes):
 
 
 def act_until(run, num_steps):
-    """Makes a run stop at an agent step: a kill unless it is finished afterwards."""
+    """Makes a run stop at an agent step; without `finish` that is like a kill."""
     act = run.act
 
     def act_and_stop(observations):
@@ -233,7 +233,7 @@ def test_several_environments_resume_bit_for_bit_and_count_as_one(tmp_path):
 
 
 @pytest.mark.parametrize("num_environments", [1, 2])
-def test_a_run_that_is_stopped_again_and_again_is_that_of_an_unbroken_one(
+def test_a_run_that_is_stopped_again_and_again_equals_an_unbroken_one(
     tmp_path, num_environments
 ):
     # Every third step, so that a stop may fall between an episode's last update and its

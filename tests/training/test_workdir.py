@@ -7,8 +7,10 @@ import time
 import pytest
 
 from jaxil import config as jaxil_config
+from jaxil import outside
 from jaxil.errors import UsageError
-from jaxil.training import workdir
+from jaxil.training import trained, workdir
+from tests.tiny_agent import NETWORKS, make_params
 
 
 def write(folder, config):
@@ -106,6 +108,28 @@ def test_the_longest_name_will_do(tmp_path):
             path, jaxil_config.default_config("pdac", "walker_run"), {}
         )
     assert (path / "config.json").is_file()
+
+
+def test_a_path_too_long_to_look_up_is_one_message(tmp_path):
+    folder = tmp_path.joinpath(*["x" * 255] * 20)
+    config = jaxil_config.default_config("pdac", "walker_run")
+    assert workdir.problems(folder, config) == []  # its nearest parent is writable
+    with pytest.raises(UsageError, match="workdir="), workdir.opened(folder):
+        pass
+
+
+def test_a_policy_makes_no_task_of_code_that_its_run_alone_names(tmp_path, monkeypatch):
+    (tmp_path / "harmful.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(tmp_path)
+    config = jaxil_config.default_config("zero")
+    config.task = "harmful:make"
+    counters = {"num_steps": 0, "seconds": 0.0}
+    policy = trained.Policy(config, NETWORKS, make_params(0), counters)
+    with pytest.raises(UsageError, match="--trust=harmful:make"):
+        policy.make_environment()
+    monkeypatch.setattr(outside, "_trusted", {config.task})
+    with pytest.raises(SystemExit, match="imported"):
+        policy.make_environment()
 
 
 def test_an_open_folder_is_in_use(tmp_path):
