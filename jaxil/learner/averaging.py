@@ -17,16 +17,16 @@ def average_policy(
 
         a_n = a_{n-1} + max(tau, 1 / n) (p_n - a_{n-1})
 
-    the mean of all policies for 1 / tau updates, then an exponential average.
+    This is the mean of all policies for 1 / tau updates, then an exponential average.
 
     Args:
-      average: a_{n-1}; any finite where n is 1.
+      average: a_{n-1}; ignored where n is 1, but must be finite.
       newest: p_n.
       num_updates: n, at least 1. Shape [].
-      tau: share of the newest.
+      tau: weight of the newest policy once n exceeds 1 / tau.
 
     Source: Polyak and Juditsky 1992 average iterates; of policies, e.g. Lillicrap et
-    al. 2016 (DDPG's target actor), here for evaluation alone.
+    al. 2016 (DDPG's target actor). Here the average is only evaluated.
     """
     chex.assert_rank(num_updates, 0)
     chex.assert_trees_all_equal_shapes(average, newest)
@@ -36,7 +36,7 @@ def average_policy(
 
 
 def begin_average(state: TrainState) -> TrainState:
-    """Returns a state whose updates `make_averaging_step` may average."""
+    """Returns the state with its newest policy as the first average."""
     return state.replace(average=PolicyParams(*map(copy_params, state.newest_policy)))
 
 

@@ -1,4 +1,4 @@
-"""Learning steps that assemble stacks of frames from a device copy."""
+"""Learning steps that assemble stacks from frames kept on the device."""
 
 import functools
 from collections.abc import Callable
@@ -30,12 +30,12 @@ class Frames(NamedTuple):
 
 
 def gather_batch(frames: Data, batch: Batch) -> Batch:
-    """Replaces the frame indices of a batch from `Replay.sample` by stacks."""
+    """Replaces the frame indices of a batch from `Replay.sample` with stacks."""
     return batch.map_observations(functools.partial(gather_stacks, frames))
 
 
 def gather_expert(frames: Data, expert: ExpertBatch) -> ExpertBatch:
-    """Replaces frame indices by stacks.
+    """Replaces frame indices with stacks.
 
     Args:
       frames: see `Frames.expert`.
@@ -47,7 +47,7 @@ def gather_expert(frames: Data, expert: ExpertBatch) -> ExpertBatch:
 
 
 def make_gathering_step(step: Step) -> Step:
-    """Returns a step that takes frame indices if it is given the frames.
+    """Returns a step that also accepts frame indices, together with the frames.
 
     (state, batch, expert, frames) -> (state, metrics). With frames, batches hold
     indices instead of pixels, see `gather_batch` and `gather_expert`.
@@ -62,13 +62,13 @@ def make_gathering_step(step: Step) -> Step:
         expert: ExpertBatch | None,
         frames: Frames | None = None,
     ) -> tuple[TrainState, Metrics]:
-        if frames is not None and batch is not None:
-            batch = gather_batch(frames.agent, batch)
-        if frames is not None and expert is not None:
-            expert = gather_expert(frames.expert, expert)
         if frames is not None:
+            if batch is not None:
+                batch = gather_batch(frames.agent, batch)
+            if expert is not None:
+                expert = gather_expert(frames.expert, expert)
             # Otherwise XLA may fuse the gathering with what follows and sum in another
-            # order: a device copy would change the results of a run.
+            # order: a run would depend on where its frames are.
             batch, expert = jax.lax.optimization_barrier((batch, expert))
         return step(state, batch, expert)
 

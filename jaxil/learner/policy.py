@@ -22,8 +22,8 @@ def make_sample_action(
     """Returns the policy that collects experience.
 
     (encoder params, actor params, observations [E, H, W, C], key, num_steps [E]) ->
-    actions [E, A]. `num_steps` counts agent steps: it sets the noise's size and, with
-    the run's base key, the noise itself, which is clipped in updates only, not here.
+    actions [E, A], for E environments. The agent step `num_steps` sets the noise's
+    standard deviation and, with the key, its draw. Only updates clip the noise.
 
     Args:
       networks: the agent's.

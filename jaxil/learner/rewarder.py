@@ -42,18 +42,19 @@ class AgentSpec(NamedTuple):
 
 
 class AgentView(NamedTuple):
-    """The agent's samples, as its update computed them before its step.
+    """The agent's samples, with features from before the update's step.
+
+    The last three are None unless the method has `samples_successors`.
 
     Attributes:
       observation: augmented pixels. Shape [B, H, W, C].
-      features: critic trunk features of them, without gradient. Shape [B, D].
+      features: critic trunk features of `observation`, without gradient. Shape [B, D].
       action: shape [B, A].
-      unshifted: the pixels as they were stored. Shape [B, H, W, C].
-      successor: the observations one step later, augmented. Like `observation`; None
-        unless the method has `samples_successors`, as the next two.
-      successor_features: their features. Like `features`.
-      unshifted_successor: they as they were stored, for methods that shift an
-        observation and its successor alike. Like `unshifted`.
+      unshifted: the pixels as stored. Shape [B, H, W, C].
+      successor: the observations one step later, augmented. Like `observation`.
+      successor_features: features of `successor`. Like `features`.
+      unshifted_successor: successors as stored, for methods that shift an observation
+        and its successor alike. Like `unshifted`.
     """
 
     observation: Array
@@ -108,7 +109,7 @@ def _ignore_episode(
 
 
 class Rewarder(NamedTuple):
-    """An imitation method, as (init, update) is an optimiser in optax.
+    """An imitation method as pure functions, like optax's (init, update).
 
     Attributes:
       rewards: (state, learner, episode, expert_episodes) -> rewards [T]; reward t
@@ -120,21 +121,21 @@ class Rewarder(NamedTuple):
       observe: (state, learner, episode, expert_episodes) -> state. Called once for
         each episode, at its end and before it is rewarded.
       expert_batch_size: expert samples that `update` gets; 0: `expert` is None.
-      matches_episodes: whether `observe` and `rewards` read whole demonstrations;
-        without, `expert_episodes` is None.
-      samples_successors: whether samples of agent and expert come with the
-        observation one step later.
+      matches_episodes: whether `observe` and `rewards` read whole demonstrations; if
+        not, `expert_episodes` is None.
+      samples_successors: whether samples of agent and expert include the observation
+        one step later.
       relabel: (state, learner, batch) -> rewards [B, n], for methods that reward each
         batch by the current state; `batch` has its window. None where rewards are
         stored.
       rewards_changed: state -> whether an episode rewarded before the last `observe`
         would get other rewards now. None where stored rewards never change.
       actor_loss: (state, learner, agent, expert, key) -> scalar, added to the actor's
-        loss and differentiated for `learner.actor`; the other networks of `learner`
-        have made this update's step. None without.
+        loss and differentiated with respect to `learner.actor`; encoder and critic are
+        those after this update's step. None if there is no such term.
       plan: (state, learner, episode, expert_episodes) -> the transport plan
         [T + 1, N + 1] behind `rewards`, for reports, and the index of its
-        demonstration; None without one.
+        demonstration. None if there is no plan.
       summary: state -> scalars worth logging after an episode.
     """
 
@@ -180,7 +181,7 @@ def make_refresh(rewarder: Rewarder) -> Callable[..., Array]:
     where each episode's frames are in `frames`; all episodes have one length.
 
     Args:
-      rewarder: its rewards must follow from frames and actions alone: task rewards
+      rewarder: its rewards must depend on frames and actions alone, since task rewards
         are not stored.
     """
 

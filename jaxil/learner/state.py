@@ -46,15 +46,15 @@ class TrainState(struct.PyTreeNode):
     checkpoint holds learned values only.
 
     Attributes:
-      encoder: trained by the critic loss alone.
-      actor: trained by the actor loss.
-      critic: trained by the critic loss.
+      encoder: trained by the critic loss alone; by cloning in BC, BCO and BCV-LR.
+      actor: trained by the actor loss; by cloning in those three.
+      critic: trained by the critic loss; not trained in those three.
       target_critic: slow copy of the critic's parameters.
       rewarder: what the imitation method learns or remembers.
       key: base random key. Never consumed: update number n uses
         `fold_in(key, n)`, so a resumed run has the random numbers of an unbroken one.
       num_updates: gradient steps so far. Shape [], int32.
-      average: of the policies so far, see `averaging.average_policy`; None where the
+      average: of all policies so far, see `averaging.average_policy`; None where the
         newest is evaluated.
     """
 
@@ -84,7 +84,7 @@ class TrainState(struct.PyTreeNode):
 
 
 def init_module(params: Params, optimiser: optax.GradientTransformation) -> ModuleState:
-    """Returns fresh optimiser statistics around `params`."""
+    """Returns `params` with fresh optimiser statistics."""
     return ModuleState(params=params, opt_state=optimiser.init(params))
 
 
@@ -94,7 +94,7 @@ Module = TypeVar("Module", bound=ModuleState)
 def apply_gradients(
     module: Module, gradients: Params, optimiser: optax.GradientTransformation
 ) -> Module:
-    """Returns `module` after one optimiser step, what else it holds as it was."""
+    """Returns `module` after one optimiser step, other fields unchanged."""
     updates, opt_state = optimiser.update(gradients, module.opt_state, module.params)
     params = optax.apply_updates(module.params, updates)
     return module.replace(params=params, opt_state=opt_state)

@@ -28,7 +28,7 @@ UpdateStep = Callable[
 
 @dataclasses.dataclass(frozen=True)
 class Learner:
-    """What training does not change; the compiler sees constants.
+    """What training does not change: constants of the compiled step.
 
     Attributes:
       networks: encoder, actor and critic.
@@ -94,7 +94,7 @@ def init_train_state(
 def make_update_step(learner: Learner) -> UpdateStep:
     """Returns the learning step, to be jitted with its state donated.
 
-    The order is that of the reference: relabel, if the method does; augment; rewarder
+    The order is that of the references: relabel, if the method does; augment; rewarder
     on pre-update features; critic, which alone trains the encoder; actor with the
     updated critic on the pre-update representation; target critic last.
     """
@@ -131,8 +131,8 @@ def make_update_step(learner: Learner) -> UpdateStep:
         state, actor_metrics = _update_actor(
             learner, state, representation, std, actor_key, agent, expert
         )
-        # The rewarder's step is written last but reads only values from before
-        # this update, as if it came first; so the features are computed once.
+        # Written last, since it needs the critic's features, but as if it came first:
+        # all values are from before this update.
         rewarder, rewarder_metrics = learner.rewarder.update(
             state.rewarder, before, agent, expert, rewarder_key
         )
@@ -156,7 +156,7 @@ def make_update_step(learner: Learner) -> UpdateStep:
 def _with_successors(
     learner: Learner, before: LearnerParams, batch: Batch, agent: AgentView, key: Array
 ) -> AgentView:
-    """Adds successors: augmented, their features without gradient, and as stored."""
+    """Adds the fields of `AgentView` that describe successors."""
     assert batch.successor is not None
     # A separate key, so that no other random number depends on successors.
     successor = _augment(learner, batch.successor, jax.random.fold_in(key, 1))
@@ -177,11 +177,11 @@ def _augment(learner: Learner, observation: Array, key: Array) -> Array:
 def _update_critic(
     learner: Learner, state: TrainState, batch: Batch, std: Array, key: Array
 ) -> tuple[TrainState, Array, Array, Metrics]:
-    """Steps critic and encoder; also returns their pre-update outputs.
+    """Steps critic and encoder.
 
     Returns:
-      The state, the representation [B, R] and the critic's features [B, D] of the
-      observations, both without gradient, and metrics.
+      The state; the representation [B, R] and the critic's features [B, D] of the
+      observations, from before the step and without gradient; metrics.
     """
     encoder, actor, critic = learner.networks
     # There is no target encoder: next observations pass through the live one.
@@ -229,7 +229,7 @@ def _update_actor(
     agent: AgentView,
     expert: ExpertBatch | None,
 ) -> tuple[TrainState, Metrics]:
-    """Steps the actor against the updated critic, and the method's own term."""
+    """Steps the actor on the updated critic's values and the method's own term."""
     _, actor, critic = learner.networks
 
     def loss(params: Params) -> tuple[Array, Array]:

@@ -7,7 +7,7 @@ from jax import Array
 
 
 def augment(observation: Array, key: Array, *, padding: int) -> Array:
-    """Shifts pixels [B, H, W, C] with `random_shift`; returns states [B, S] as is."""
+    """Shifts pixels [B, H, W, C] by `random_shift`; leaves states [B, S] unchanged."""
     chex.assert_rank(observation, {2, 4})
     if observation.ndim == 2:
         return observation
@@ -17,7 +17,7 @@ def augment(observation: Array, key: Array, *, padding: int) -> Array:
 def augment_pair(
     first: Array, second: Array, key: Array, *, padding: int
 ) -> tuple[Array, Array]:
-    """Augments two observations in turn by one shift, so that what moved is kept.
+    """Shifts two consecutive observations alike, so that motion is preserved.
 
     Args:
       first: o_t. Shape [B, H, W, C], or [B, S].
@@ -35,9 +35,9 @@ def random_shift(images: Array, key: Array, *, padding: int) -> Array:
     """Shifts each image by whole pixels, repeating the border.
 
     Every image is padded by `padding` pixels of its own edge and cropped to its
-    original size at a corner sampled uniformly from {0, ..., 2 * padding}^2. All
-    channels of an image move together. DrQ-v2 interpolates bilinearly, but its sampling
-    points fall on pixel centres, so the crop is the same up to rounding.
+    original size at a corner sampled uniformly from {0, ..., 2 * padding}^2, the same
+    for all its channels. DrQ-v2 interpolates bilinearly, but its sampling points fall
+    on pixel centres, so the crop is the same up to rounding.
 
     Args:
       images: any dtype. Shape [B, H, W, C].

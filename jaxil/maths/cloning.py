@@ -1,4 +1,4 @@
-"""Cloning of actions that several inverse models infer, by how far they are trusted."""
+"""Cloning of inferred actions, weighted by how far each is trusted."""
 
 import chex
 import jax
@@ -7,7 +7,7 @@ from jax import Array
 
 
 def disagreement(actions: Array) -> Array:
-    """Returns how far the models' actions for one transition lie apart, [B].
+    """Returns the variance of the models' actions for each transition, [B].
 
         d_b = sum_a var_m g_m(e_b, e'_b)_a,    var_m x = mean_m (x_m - mean_m x)^2
 
@@ -25,7 +25,7 @@ def disagreement(actions: Array) -> Array:
 
 
 def agreement_trust(distance: Array, *, scale: float) -> Array:
-    """Returns the trust in labels by their models' disagreement, [B].
+    """Returns the trust in labels, given their models' disagreement, [B].
 
         w_b = exp(-d_b / scale),    in [0, 1]
 
@@ -58,7 +58,7 @@ def q_filter(label_values: Array, policy_values: Array) -> Array:
 
 
 def trusted_cloning_loss(action: Array, label: Array, trust: Array) -> Array:
-    """Returns the squared distance of the policy from labels, by their trust.
+    """Returns the mean squared distance of the policy from labels, weighted by trust.
 
         L = mean_b w_b |pi(e_b) - label_b|^2
 
@@ -84,8 +84,8 @@ def value_scale(values: Array) -> Array:
 
         s = mean_b |min_k Q_k(o_b, a_b)|
 
-    A term of the actor's loss that is multiplied by it keeps its share when all rewards
-    are multiplied by a number.
+    Multiplied by it, a term keeps its share of the actor's loss whatever the scale of
+    the rewards.
 
     Source: TD3+BC, Fujimoto and Gu 2021, arXiv:2106.06860, which divides the other term
     by it.

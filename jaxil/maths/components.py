@@ -1,4 +1,4 @@
-"""Principal components of rows that arrive in parts."""
+"""Principal components of rows that arrive in batches."""
 
 import chex
 import jax.numpy as jnp
@@ -10,10 +10,10 @@ _TINY = 1e-12  # keeps directions without variance at zero instead of NaN
 def merge(sketch: Array, rows: Array) -> Array:
     """Adds rows to a sketch of those before them.
 
-        S'^T S' = the best approximation of rank J of S^T S + X^T X
+        S'^T S' = the best rank-J approximation of S^T S + X^T X
 
-    With U and L^2 the first J eigenvectors and eigenvalues of [S; X] [S; X]^T, which
-    is small where rows are few and long, S' = U^T [S; X] = L V^T. It is exact while all
+    S' = U^T [S; X] = L V^T, with U and L^2 the first J eigenvectors and eigenvalues of
+    [S; X] [S; X]^T, which is small where rows are few and long. Exact as long as all
     rows so far have at most rank J.
 
     Args:
@@ -21,8 +21,8 @@ def merge(sketch: Array, rows: Array) -> Array:
       rows: X, less their mean. Shape [M, P].
 
     Returns:
-      S': principal directions, the largest first, each as long as the root of the
-      rows' sum of squares along it. Shape [J, P].
+      S': principal directions, the largest first; the length of each is the root of
+      the rows' sum of squares along it. Shape [J, P].
 
     Source: merge-and-truncate, Ross et al. 2008, Incremental learning for robust
     visual tracking, sec. 3.1, with a fixed mean.
@@ -37,7 +37,7 @@ def merge(sketch: Array, rows: Array) -> Array:
 
 
 def project(rows: Array, sketch: Array) -> Array:
-    """Returns coordinates along a sketch's directions: [M, P], [J, P] to [M, J]."""
+    """Returns coordinates along the sketch's directions: [M, P], [J, P] to [M, J]."""
     chex.assert_rank([rows, sketch], 2)
     chex.assert_equal_shape_suffix([rows, sketch], 1)
     lengths = jnp.linalg.norm(sketch, axis=1, keepdims=True)

@@ -18,7 +18,7 @@ def convolve_relu(images: Array, kernel: Array, bias: Array, stride: int) -> Arr
     """
     chex.assert_rank([images, kernel, bias], [4, 4, 1])
     chex.assert_equal(bias.shape[0], kernel.shape[3])
-    return jax.nn.relu(_XLA(stride, images, kernel) + bias[None, None, None])
+    return jax.nn.relu(_CONVOLVE(stride, images, kernel) + bias[None, None, None])
 
 
 def _plain(stride: int, images: Array, kernel: Array) -> Array:
@@ -32,7 +32,7 @@ def _plain(stride: int, images: Array, kernel: Array) -> Array:
 def _forward(
     stride: int, images: Array, kernel: Array
 ) -> tuple[Array, tuple[Array, Array]]:
-    return _XLA(stride, images, kernel), (images, kernel)
+    return _CONVOLVE(stride, images, kernel), (images, kernel)
 
 
 def _backward(
@@ -42,14 +42,14 @@ def _backward(
     _, to_both = jax.vjp(functools.partial(_plain, stride), images, kernel)
     image_gradient, kernel_gradient = to_both(cotangent)
     if kernel.shape[:2] == (stride, stride):
-        # The gradient penalty on pixels differentiates this again. On a CPU XLA's own
-        # version of that takes a fifth of DAC's update.
+        # The gradient penalty on pixels differentiates this again. On a CPU that would
+        # take a fifth of DAC's update with XLA's own gradient.
         image_gradient = tile_gradient(cotangent, kernel, images.shape[1:3])
     return image_gradient, kernel_gradient
 
 
-_XLA: Any = jax.custom_vjp(_plain, nondiff_argnums=(0,))
-_XLA.defvjp(_forward, _backward)
+_CONVOLVE: Any = jax.custom_vjp(_plain, nondiff_argnums=(0,))
+_CONVOLVE.defvjp(_forward, _backward)
 
 
 def tile_gradient(cotangent: Array, kernel: Array, size: tuple[int, ...]) -> Array:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 _NORM_FLOOR = 1e-12  # added under the root: d|g|/dg is undefined at g = 0
-_STD_FLOOR = 1e-6  # leaves features that are all alike at zero instead of NaN
+_STD_FLOOR = 1e-6  # makes a constant feature 0 instead of NaN
 
 
 def td_target(reward: Array, discount: Array, next_values: Array) -> Array:
@@ -44,7 +44,7 @@ def critic_loss(values: Array, target: Array) -> Array:
 
 
 def actor_loss(values: Array) -> Array:
-    """Returns minus the mean of the smaller of both values [2, B].
+    """Returns minus the mean of the smaller of the two values [2, B].
 
     Source: Yarats et al. 2021, arXiv:2107.09645, eq. (2).
     """
@@ -138,17 +138,18 @@ def prediction_loss(prediction: Array, features: Array) -> Array:
 
         L = mean_bd (p_bd - (z_bd - m_d) / s_d)^2
 
-    with mean m and standard deviation s of each feature over the batch. Whoever guesses
-    the same for every row has at best L = 1, however small s is (above 1e-6), so that
-    nothing is gained by shrinking features to a constant. It is no guard against
-    features that all tell the same.
+    with mean m and standard deviation s of each feature over the batch. A prediction
+    that is the same for every row has at best L = 1, however small s is (above 1e-6),
+    so shrinking the features to a constant gains nothing. Features that all carry the
+    same information are not prevented.
 
     Args:
       prediction: p. Shape [B, D].
       features: z, without gradient. Shape [B, D].
 
-    Source: liuxin0824/BCV-LR, models.py, `WorldModel.label`, is the squared error; its
-    features need no standard deviations, since the error does not train them.
+    Source: the squared error is that of liuxin0824/BCV-LR, models.py,
+    `WorldModel.label`, whose features the error does not train and which therefore
+    needs no standard deviations.
     """
     chex.assert_rank([prediction, features], 2)
     chex.assert_equal_shape([prediction, features])

@@ -10,7 +10,7 @@ from jax import Array
 
 
 def nearest_codes(latent: Array, codebook: Array) -> Array:
-    """Returns the index of each part's nearest code, the first of several.
+    """Returns the index of each part's nearest code, the first if several are.
 
         k_p = argmin_m |z_p - c_pm|^2 = argmin_m |c_pm|^2 - 2 <z_p, c_pm>
 
@@ -30,9 +30,9 @@ def nearest_codes(latent: Array, codebook: Array) -> Array:
 
 
 def look_up(indices: Array, codebook: Array) -> Array:
-    """Returns the codes of these indices: [B, P], [P, M, L] to [B, P, L].
+    """Returns the codes at these indices: [B, P], [P, M, L] to [B, P, L].
 
-    Its gradient reaches those codes alone: a code that is no vector's nearest stays.
+    Only codes that are looked up get a gradient.
 
     Source: van den Oord et al. 2017, arXiv:1711.00937, eq. (2).
     """
@@ -54,7 +54,7 @@ def straight_through(latent: Array, code: Array) -> Array:
 
 
 def codebook_loss(latent: Array, code: Array) -> Array:
-    """Returns the mean squared distance, which moves codes towards their latents.
+    """Returns the mean squared distance that moves codes towards their latents.
 
         L = mean (stop(z) - c)^2
 
@@ -68,7 +68,7 @@ def codebook_loss(latent: Array, code: Array) -> Array:
 
 
 def commitment_loss(latent: Array, code: Array) -> Array:
-    """Returns the mean squared distance, which moves latents towards their codes.
+    """Returns the mean squared distance that moves latents towards their codes.
 
         L = mean (z - stop(c))^2
 
@@ -82,11 +82,9 @@ def commitment_loss(latent: Array, code: Array) -> Array:
 
 
 def perplexity(indices: Array, *, num_codes: int) -> Array:
-    """Returns how many codes a part uses, in [1, M], as the mean over parts.
+    """Returns the effective number of codes in use, in [1, M], as the mean over parts.
 
         mean_p exp(-sum_m f_pm log f_pm),   f_pm = share of code m among B indices
-
-    Codes that are used equally often count one each, rarer ones less.
 
     Args:
       indices: shape [B, P].

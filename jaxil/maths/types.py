@@ -33,7 +33,7 @@ class Window(NamedTuple):
 class Batch(NamedTuple):
     """Sampled transitions of n agent steps.
 
-    Where frames are on the device, observations are the indices of their frames
+    Where frames are kept on the device, observations are indices of their F frames
     instead: int32 [B, F], the oldest first.
 
     Attributes:
@@ -55,7 +55,7 @@ class Batch(NamedTuple):
     window: Window | None = None
 
     def map_observations(self, function: Callable[[Data], Data]) -> "Batch":
-        """Returns a batch with the function's results instead of all observations."""
+        """Returns the batch with `function` applied to all its observations."""
         successor, window = self.successor, self.window
         if window is not None:
             window = window._replace(observation=function(window.observation))
@@ -82,7 +82,7 @@ class ExpertBatch(NamedTuple):
     successor: Data | None = None
 
     def map_observations(self, function: Callable[[Data], Data]) -> "ExpertBatch":
-        """Returns a batch with the function's results instead of all observations."""
+        """Returns the batch with `function` applied to all its observations."""
         successor = self.successor
         return self._replace(
             observation=function(self.observation),

@@ -1,10 +1,10 @@
 /* Convolutions and their gradients, accumulated in blocks of registers.
 
-   A convolution sums products of a number with a vector of features. BLOCK points times
-   two vectors accumulate in registers: enough independent sums to hide the latency of a
-   multiply-add, with BLOCK uses of each vector that is loaded. Both lengths are known
-   at compile time, so loops over them are unrolled. The number of features must be a
-   multiple of two vectors. */
+   A convolution sums products of a number with a vector of features. Sums for BLOCK
+   points times two vectors are kept in registers: enough independent sums to hide the
+   latency of a multiply-add, and BLOCK uses of each vector that is loaded. Both lengths
+   are known at compile time, so loops over them are unrolled. The number of features
+   must be a multiple of two vectors. */
 
 #ifndef JAXIL_BLOCKS_H
 #define JAXIL_BLOCKS_H
@@ -13,7 +13,7 @@
 #include <stdint.h>
 
 #if defined(__clang__)
-#error "it is for GCC: what clang makes of it is half as fast as XLA's"
+#error "GCC is needed: compiled by clang, this is half as fast as XLA's convolutions"
 #endif
 
 /* 28 of 32 registers, or 12 of 16, hold sums. */
@@ -70,12 +70,13 @@ typedef struct {
   size_t row, step; /* offsets to the next point below and to the right */
 } Points;
 
-INLINE Points one_after_the_other(const Shape *s, float *at) {
+INLINE Points contiguous(const Shape *s, float *at) {
   return (Points){at, s->out_width * s->features, s->features};
 }
 
-/* What follows a sum: relu(sum + bias), with one bias per feature; or, with one gate
-   per sum, the sum where the gate is positive and 0 elsewhere. */
+/* What is done with a sum; one of the two is NULL. With a bias for each feature:
+   relu(sum + bias). With a gate for each sum: the sum where the gate is positive, else
+   0. */
 typedef struct {
   const float *bias, *gate;
 } Finish;

@@ -11,6 +11,7 @@ import hashlib
 import os
 import pathlib
 import shutil
+import signal
 import subprocess
 import tempfile
 
@@ -104,19 +105,27 @@ def _is_whole(path: pathlib.Path) -> bool:
 
 def _compile(compiler: str, flags: tuple[str, ...], output: pathlib.Path) -> None:
     # XLA's headers are part of jaxlib.
-    words = [*compiler.split(), *flags, f"-I{jax.ffi.include_dir()}", _SOURCE]
+    include = f"-I{jax.ffi.include_dir()}"
+    command = [*compiler.split(), *flags, include, _SOURCE, "-o", output]
     try:
-        done = subprocess.run(
-            [*words, "-o", output],
-            capture_output=True,
+        process = subprocess.Popen(
+            command,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
             text=True,
-            timeout=_COMPILE_SECONDS,
+            process_group=0,  # with the processes that the compiler starts
         )
-    except subprocess.TimeoutExpired as error:
-        raise BuildError(f"{compiler} exceeds {_COMPILE_SECONDS:.0f} s") from error
     except OSError as error:
         raise BuildError(f"{compiler} cannot be run: {error.strerror}") from error
-    if done.returncode or not output.exists():
-        lines = (done.stderr.strip() or "no message").splitlines()
+    try:
+        _, said = process.communicate(timeout=_COMPILE_SECONDS)
+    except BaseException as error:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        if not isinstance(error, subprocess.TimeoutExpired):
+            raise
+        raise BuildError(f"{compiler} exceeds {_COMPILE_SECONDS:.0f} s") from error
+    if process.returncode or not output.exists():
+        lines = (said.strip() or "no message").splitlines()
         reason = next((line for line in lines if "error:" in line), lines[-1])
         raise BuildError(f"{compiler} cannot compile {_SOURCE.name}: {reason}")

@@ -121,12 +121,12 @@ static int prepare(Call *call, int backward) {
       next += kernel_size(&layer->shape, 1);
     }
     if (backward && l > 0) {
-      turn_kernel(&layer->shape, kernel, next);
-      layer->turned = next;
+      flip_kernel(&layer->shape, kernel, next);
+      layer->flipped = next;
       next += kernel_size(&layer->back, 0);
       if (layer->back_winograd) {
-        transform_kernel(&layer->back, layer->turned, next);
-        layer->turned = next;
+        transform_kernel(&layer->back, layer->flipped, next);
+        layer->flipped = next;
         next += kernel_size(&layer->back, 1);
       }
     }
@@ -193,18 +193,18 @@ XLA_FFI_Error *jaxil_encode(XLA_FFI_CallFrame *frame) {
 
 /* Images per partial sum of gradients. The number is constant and partial sums are
    added in order, so the result does not depend on the number of threads. */
-#define IMAGES_OF_A_SUM 4
+#define IMAGES_PER_SUM 4
 
-/* Size of the array for the cotangent of layer l. The first layer needs no frame, since
-   pixels have no gradient. */
+/* Size of the array for the cotangent of layer l. The first layer needs no padding,
+   since pixels have no gradient. */
 static size_t cotangent_size(const Layer *layer, size_t l) {
   return l ? image_size(&layer->back) : output_size(&layer->shape);
 }
 
 static Points place_cotangent(const Layer *layer, size_t l, float *array) {
-  if (l == 0) return one_after_the_other(&layer->shape, array);
+  if (l == 0) return contiguous(&layer->shape, array);
   memset(array, 0, cotangent_size(layer, l) * sizeof(float));
-  return in_frame(layer, array);
+  return inside_padding(layer, array);
 }
 
 static size_t largest_cotangent(const Call *call) {
@@ -226,10 +226,10 @@ static void differentiate_image(const Call *call, size_t image, float *sums, flo
   const Layer *layers = call->layers;
   const size_t last = call->count - 1, size = output_size(&layers[last].shape);
   float *first = x + image_size(&layers[0].shape);
-  float *second = first + largest_cotangent(call), *frames[] = {first, second};
-  float *scratch = second + largest_cotangent(call), *frame = frames[last % 2];
+  float *second = first + largest_cotangent(call), *arrays[] = {first, second};
+  float *scratch = second + largest_cotangent(call), *cotangent = arrays[last % 2];
   centre(call, image, x);
-  Points g = place_cotangent(&layers[last], last, frame);
+  Points g = place_cotangent(&layers[last], last, cotangent);
   pass_relu(&layers[last].shape, call->y[last] + image * size,
             call->cotangent + image * size, g);
   for (size_t l = last;; l--) {
@@ -239,29 +239,29 @@ static void differentiate_image(const Call *call, size_t image, float *sums, flo
     float *bias = kernel + kernel_size(&layer->shape, layer->winograd);
     add_gradients(layer, from, g, kernel, bias, scratch);
     if (l == 0) return;
-    float *next = frames[(l - 1) % 2];
+    float *next = arrays[(l - 1) % 2];
     g = place_cotangent(&layers[l - 1], l - 1, next);
-    go_backward(layer, frame, from, g, scratch);
-    frame = next;
+    go_backward(layer, cotangent, from, g, scratch);
+    cotangent = next;
   }
 }
 
 static void differentiate_images(void *data, size_t part, float *scratch) {
   const Call *call = data;
   float *sums = call->sums + part * call->sum_size;
-  const size_t first = part * IMAGES_OF_A_SUM, end = first + IMAGES_OF_A_SUM;
+  const size_t first = part * IMAGES_PER_SUM, end = first + IMAGES_PER_SUM;
   memset(sums, 0, call->sum_size * sizeof(float));
   for (size_t image = first; image < end && image < call->batch; image++)
     differentiate_image(call, image, sums, scratch);
 }
 
-#define NUMBERS_OF_A_SLICE 4096
+#define FLOATS_PER_SLICE 4096
 
 static void add_up_slice(void *data, size_t slice, float *scratch) {
   const Call *call = data;
   (void)scratch;
-  const size_t first = slice * NUMBERS_OF_A_SLICE;
-  size_t end = first + NUMBERS_OF_A_SLICE;
+  const size_t first = slice * FLOATS_PER_SLICE;
+  size_t end = first + FLOATS_PER_SLICE;
   if (end > call->sum_size) end = call->sum_size;
   for (size_t sum = 1; sum < call->num_sums; sum++) {
     const float *addend = call->sums + sum * call->sum_size;
@@ -282,13 +282,14 @@ XLA_FFI_Error *jaxil_encode_gradient(XLA_FFI_CallFrame *frame) {
     call.sum_size += layer->shape.features;
   }
   call.cotangent = argument(frame, 2 + 3 * call.count)->data;
-  call.num_sums = (call.batch + IMAGES_OF_A_SUM - 1) / IMAGES_OF_A_SUM;
+  /* An empty batch has one sum, of zeros. */
+  call.num_sums = larger(1, (call.batch + IMAGES_PER_SUM - 1) / IMAGES_PER_SUM);
   call.sums = malloc(call.num_sums * call.sum_size * sizeof(float));
   if (call.sums == NULL || !prepare(&call, 1)) {
     free(call.sums);
     return no_memory(frame);
   }
-  const size_t slices = (call.sum_size + NUMBERS_OF_A_SLICE - 1) / NUMBERS_OF_A_SLICE;
+  const size_t slices = (call.sum_size + FLOATS_PER_SLICE - 1) / FLOATS_PER_SLICE;
   const int done = for_each(call.num_sums, frame, differentiate_images, &call,
                             gradient_scratch(&call)) &&
                    for_each(slices, frame, add_up_slice, &call, 0);

@@ -45,7 +45,7 @@ def encode(
 
     Args:
       pixels: uint8 [B, H, W, C].
-      mean: float32 [H, W, C], or one number of any rank.
+      mean: float32 [H, W, C], or a single number of any rank.
       weights: at most MOST_LAYERS.
       contrast: factor on the centred pixels.
       strides: s of each layer.
@@ -84,7 +84,7 @@ def _forward(
     settings: _Settings, pixels: Array, mean: Array, weights: tuple[Weights, ...]
 ) -> tuple[Array, tuple]:
     outputs = _outputs(settings, pixels, mean, weights, wanted=len(weights))
-    # Outputs are positive where ReLU was active.
+    # No need of z: an output is positive where its ReLU was active.
     return outputs[-1], (pixels, mean, weights, outputs)
 
 

@@ -9,11 +9,11 @@
 #include "winograd.h"
 
 /* A convolution, and `back`, which computes its image gradient: the convolution of the
-   cotangent, in a frame of zeros, with the flipped kernel. */
+   cotangent, padded with zeros, with the flipped kernel. */
 typedef struct {
   Shape shape, back;
-  int winograd, back_winograd;  /* whether Winograd's form is used */
-  const float *kernel, *turned; /* transformed if so */
+  int winograd, back_winograd;   /* whether Winograd's form is used */
+  const float *kernel, *flipped; /* transformed if so */
   const float *bias;
 } Layer;
 
@@ -50,21 +50,21 @@ static Layer make_layer(Shape s) {
   };
 }
 
-/* The points of a layer's cotangent in its frame: spaced by the stride, with a border
-   of zeros as wide as the kernel reaches. */
-static Points in_frame(const Layer *layer, float *frame) {
+/* The points of a layer's cotangent in its padded array: spaced by the stride, inside
+   a border that is as wide as the kernel reaches. */
+static Points inside_padding(const Layer *layer, float *padded) {
   const Shape *s = &layer->shape, *back = &layer->back;
   const size_t row = back->width * back->channels;
   return (Points){
-      .at =
-          frame + (s->kernel_height - 1) * row + (s->kernel_width - 1) * back->channels,
+      .at = padded + (s->kernel_height - 1) * row +
+            (s->kernel_width - 1) * back->channels,
       .row = s->stride * row,
       .step = s->stride * back->channels,
   };
 }
 
 /* to[v, f, c] = from[last - v, c, f] */
-static void turn_kernel(const Shape *s, const float *from, float *to) {
+static void flip_kernel(const Shape *s, const float *from, float *to) {
   const size_t window = s->kernel_height * s->kernel_width;
   for (size_t v = 0; v < window; v++)
     for (size_t f = 0; f < s->features; f++)
@@ -88,7 +88,7 @@ static size_t backward_scratch(const Layer *layer) {
 static void go_forward(const Layer *layer, const float *x, float *y, float *scratch) {
   const Shape *s = &layer->shape;
   const Finish finish = {.bias = layer->bias};
-  const Points points = one_after_the_other(s, y);
+  const Points points = contiguous(s, y);
   if (layer->winograd)
     winograd_convolve(s, x, layer->kernel, &finish, points, scratch);
   else
@@ -111,14 +111,15 @@ static void add_gradients(const Layer *layer, const float *x, Points g, float *k
     correlate(s, x, g, kernel);
 }
 
-/* Computes the previous layer's cotangent before its ReLU, whose output is x. */
-static void go_backward(const Layer *layer, const float *frame, const float *x,
+/* Computes the cotangent of the previous layer before its ReLU, whose output is x, from
+   the padded cotangent of this one. */
+static void go_backward(const Layer *layer, const float *padded, const float *x,
                         Points g, float *scratch) {
   const Finish finish = {.gate = x};
   if (layer->back_winograd)
-    winograd_convolve(&layer->back, frame, layer->turned, &finish, g, scratch);
+    winograd_convolve(&layer->back, padded, layer->flipped, &finish, g, scratch);
   else
-    convolve(&layer->back, frame, layer->turned, &finish, g);
+    convolve(&layer->back, padded, layer->flipped, &finish, g);
 }
 
 /* g = the cotangent of z, given that of y = relu(z). */

@@ -47,6 +47,7 @@ static void take_part(void *data) {
   leave(data);
 }
 
+/* Returns whether a call of XLA succeeded; frees its error. */
 static int succeeded(XLA_FFI_CallFrame *frame, XLA_FFI_Error *error) {
   if (error == NULL) return 1;
   XLA_FFI_Error_Destroy_Args args = {
@@ -74,6 +75,7 @@ static size_t number_of_threads(XLA_FFI_CallFrame *frame) {
    Returns 0 if a scratch of `scratch_size` floats could not be allocated. */
 static int for_each(size_t count, XLA_FFI_CallFrame *frame, Work *work, void *call,
                     size_t scratch_size) {
+  if (count == 0) return 1;
   Team *team = malloc(sizeof(Team));
   if (team == NULL) return 0;
   *team =
@@ -92,9 +94,9 @@ static int for_each(size_t count, XLA_FFI_CallFrame *frame, Work *work, void *ca
   }
   work_on(team);
   while (atomic_load(&team->done) < count) sched_yield();
-  const int memory_was_there = !atomic_load(&team->out_of_memory);
+  const int allocated = !atomic_load(&team->out_of_memory);
   leave(team);
-  return memory_was_there;
+  return allocated;
 }
 
 #endif

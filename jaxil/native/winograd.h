@@ -232,8 +232,8 @@ static void winograd_convolve(const Shape *s, const float *x, const float *u,
   }
 }
 
-/* This many tiles fit in a core's own cache, and each sum is loaded once for them. Not
-   a power of two, so that elements do not share cache lines. */
+/* Tiles between two loads of each sum: as many as fit in a core's own cache. Not a
+   power of two, or all elements would map to the same cache lines. */
 #define TILES 60
 
 static size_t winograd_correlate_scratch(const Shape *s) {

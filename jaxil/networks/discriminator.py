@@ -26,7 +26,7 @@ class Discriminator(nn.Module):
 
 
 class Embedding(nn.Module):
-    """Separate encoder and trunk, from observations to a few bounded features."""
+    """Encoder and trunk of a network that is separate from the agent's."""
 
     encoder: Any
     feature_dim: int
@@ -56,7 +56,7 @@ class PixelDiscriminator(nn.Module):
 
 
 class TransitionDiscriminator(nn.Module):
-    """Discriminator of two observations in turn, each embedded by the same encoder."""
+    """Discriminator of two consecutive observations, embedded by the same encoder."""
 
     encoder: Any
     feature_dim: int
@@ -64,7 +64,7 @@ class TransitionDiscriminator(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Array, successor: Array) -> Array:
-        """Maps twice [B, H, W, C] to logits [B]."""
+        """Maps two arrays [B, H, W, C] to logits [B]."""
         embed = Embedding(self.encoder, self.feature_dim)
         features = [embed(observation), embed(successor)]
         return Discriminator(self.hidden_dim)(jnp.concatenate(features, axis=-1))
@@ -89,6 +89,6 @@ class PatchDiscriminator(nn.Module):
         layers = (self.width, 2), (2 * self.width, 1), (4 * self.width, 1), (1, 1)
         for number, (features, stride) in enumerate(layers):
             x = nn.leaky_relu(x, 0.2) if number else x
-            gain = nn.initializers.orthogonal(math.sqrt(2.0))
-            x = nn.Conv(features, (4, 4), stride, padding=1, kernel_init=gain)(x)
+            initial = nn.initializers.orthogonal(math.sqrt(2.0))
+            x = nn.Conv(features, (4, 4), stride, padding=1, kernel_init=initial)(x)
         return x.reshape(len(x), -1)

@@ -11,7 +11,7 @@ from jaxil.networks.layers import MLP
 
 
 class InverseModel(nn.Module):
-    """Two observations in turn, each embedded by the same encoder, to an action.
+    """Maps two consecutive observations, embedded by the same encoder, to an action.
 
     Source: Torabi et al. 2018, arXiv:1805.01954, sec. 4.1, with an encoder and a trunk
     like the agent's in front, since observations are pixels here.
@@ -24,7 +24,7 @@ class InverseModel(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Array, successor: Array) -> Array:
-        """Maps twice [B, H, W, C] to actions [B, A], in [-1, 1]."""
+        """Maps two arrays [B, H, W, C] to actions [B, A], in [-1, 1]."""
         embed = Embedding(self.encoder, self.feature_dim)
         features = [embed(observation), embed(successor)]
         mlp = MLP(self.hidden_dim, self.action_dim)
@@ -32,10 +32,10 @@ class InverseModel(nn.Module):
 
 
 class InverseModels(nn.Module):
-    """Several inverse models with one encoder and one embedding, but separate heads.
+    """Several inverse models that share encoder and trunk but have separate heads.
 
-    The heads start apart and learn from the same samples, so they come to agree where
-    there are many and less where there are few.
+    The heads start from different weights and learn from the same samples, so they
+    agree more where samples are many than where they are few.
     """
 
     encoder: Any
@@ -46,10 +46,10 @@ class InverseModels(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Array, successor: Array) -> Array:
-        """Maps twice [B, H, W, C] to each model's actions [M, B, A], in [-1, 1]."""
+        """Maps two arrays [B, H, W, C] to M models' actions [M, B, A], in [-1, 1]."""
         embed = Embedding(self.encoder, self.feature_dim)
         features = [embed(observation), embed(successor)]
-        shared: Any = None  # flax takes it, but declares numbers only
+        shared: Any = None  # flax accepts it, but its types say numbers only
         heads = nn.vmap(
             MLP,
             in_axes=shared,

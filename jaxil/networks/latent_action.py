@@ -1,4 +1,4 @@
-"""Latent actions: what a video shows of an action that nobody tells."""
+"""Latent actions, inferred from videos whose actions are unknown."""
 
 from typing import Any
 
@@ -12,14 +12,14 @@ from jaxil.maths import quantisation
 from jaxil.networks.layers import MLP, dense
 
 _DECODER_WIDTHS = (192, 128, 64)  # liuxin0824/BCV-LR, run_online.py, `idm_decoder`
-_CODE_RANGE = 5.0  # first codes lie within this over their number, as in models.py
+_CODE_RANGE = 5.0  # initial codes: uniform in +- this / num_codes, as in models.py
 
 
 class LatentActionModel(nn.Module):
-    """Infers a latent action from features of two observations in turn, and uses it.
+    """Infers latent actions from the features of two consecutive observations.
 
-    `infer` is the inverse model, `predict` the forward model, `decode` says which of
-    the agent's actions a latent one is. The published inverse and forward models are
+    `infer` is the inverse model, `predict` the forward model, and `decode` maps a
+    latent action to the agent's. The published inverse and forward models are
     convolutional, on an encoder's feature maps; these are MLPs, on a trunk's features.
 
     Attributes:
@@ -49,13 +49,13 @@ class LatentActionModel(nn.Module):
         self.codebook = self.param("codebook", _first_codes, shape)
 
     def __call__(self, features: Array, successor: Array) -> tuple[Array, Array]:
-        """Returns what `predict` and `decode` do of what `infer` does: all weights."""
+        """Runs `infer`, `predict` and `decode`, so that `init` makes all weights."""
         latent = self.infer(features, successor)
-        code = quantisation.look_up(self.nearest(latent), self.codebook)
+        code = self.codes(self.nearest(latent))
         return self.predict(features, code), self.decode(latent)
 
     def infer(self, features: Array, successor: Array) -> Array:
-        """Maps features, twice [B, D], to a latent action [B, P, L]."""
+        """Maps two arrays of features [B, D] to latent actions [B, P, L]."""
         chex.assert_rank([features, successor], 2)
         chex.assert_equal_shape([features, successor])
         latent = self.inverse(jnp.concatenate([features, successor], axis=-1))
@@ -78,7 +78,7 @@ class LatentActionModel(nn.Module):
     def decode(self, latent: Array) -> Array:
         """Maps latent actions [B, P, L] to actions [B, A], in [-1, 1].
 
-        The tanh is not in the published decoder; the actor's mean has one.
+        The published decoder has no tanh; this one does because the actor's mean has.
         """
         chex.assert_rank(latent, 3)
         return jnp.tanh(self.decoder(latent.reshape(len(latent), -1)))

@@ -48,11 +48,10 @@ class ConvolutionReLU(nn.Module):
     def weights(self, channels: int) -> Weights:
         """Returns the parameters for images with this number of channels."""
         shape = (self.kernel_size, self.kernel_size, channels, self.features)
-        gain = nn.initializers.orthogonal(scale=math.sqrt(2.0))
-        kernel = self.param("kernel", gain, shape)
-        return Weights(
-            kernel, self.param("bias", nn.initializers.zeros, (self.features,))
-        )
+        orthogonal = nn.initializers.orthogonal(scale=math.sqrt(2.0))
+        kernel = self.param("kernel", orthogonal, shape)
+        bias = self.param("bias", nn.initializers.zeros, (self.features,))
+        return Weights(kernel, bias)
 
     def __call__(self, images: Array) -> Array:
         """Maps [B, H, W, C] to [B, H', W', F] of `dtype`."""

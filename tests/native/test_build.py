@@ -2,6 +2,7 @@
 
 import os
 import stat
+import time
 
 import jax
 import pytest
@@ -12,7 +13,7 @@ from jaxil.machine import cache
 from jaxil.native import build
 from jaxil.training import agent as agents
 from jaxil.training import assembly
-from tests.processes import run_python
+from tests.processes import run_python, wait_until_gone
 
 NOT_FOR_THESE = (
     {"compute_dtype": "bfloat16"},
@@ -165,10 +166,14 @@ def test_an_older_processor_is_named(tmp_path):
 
 
 def test_a_compiler_that_hangs_is_given_up(tmp_path, monkeypatch):
-    monkeypatch.setenv("CC", compiler_that(tmp_path, "exec sleep 60"))
-    monkeypatch.setattr(build, "_COMPILE_SECONDS", 1.0)
-    with pytest.raises(build.BuildError, match="exceeds 1 s"):
+    script = f"sleep 300 & echo $! > {tmp_path}/child; wait"  # like gcc and its cc1
+    monkeypatch.setenv("CC", compiler_that(tmp_path, script))
+    monkeypatch.setattr(build, "_COMPILE_SECONDS", 2.0)
+    begin = time.monotonic()
+    with pytest.raises(build.BuildError, match="exceeds 2 s"):
         build.build(tmp_path / "cache")
+    assert time.monotonic() - begin < 200
+    wait_until_gone([int((tmp_path / "child").read_text())])
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):

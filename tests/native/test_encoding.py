@@ -179,6 +179,14 @@ def test_a_mean_of_one_number():
     assert_same((pixels, jnp.full((1, 1, 1), 0.5), weights, strides))
 
 
+def test_an_empty_batch_has_gradients_of_zero():
+    drawn = draw(8, (0, 9, 9, 3), ((3, 32, 1), (3, 32, 1)))
+    value, *gradients = value_and_gradients(encoding.encode, *drawn)
+    assert value.shape == (0, 5, 5, 32)
+    for gradient in gradients:
+        np.testing.assert_array_equal(gradient, np.zeros_like(gradient))
+
+
 def test_each_image_of_a_vmapped_batch_is_encoded():
     pixels, mean, weights, strides = draw(2, (3, 9, 8, 2), ((3, 32, 1), (3, 32, 1)))
     form = functools.partial(

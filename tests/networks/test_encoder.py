@@ -186,7 +186,7 @@ class NativeTest(chex.TestCase):
 
 
 def test_parameters_are_those_of_flaxs_convolutions():
-    # Checkpoints and seeds of runs from before there was a layer of our own go on.
+    # Earlier runs used flax's layer: their checkpoints and seeds stay valid.
     class Flaxs(nn.Module):
         @nn.compact
         def __call__(self, x):
