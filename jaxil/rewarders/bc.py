@@ -1,7 +1,7 @@
 """Behavioural cloning, a baseline: the policy copies the expert's actions.
 
-The agent never acts in the environment, and its frames count updates: as many as other
-methods would make in that time.
+The agent never acts in the environment; an update counts as the frames that another
+method would play for it.
 """
 
 import chex
@@ -33,7 +33,7 @@ METHOD = methods.Method(
 
 
 def make_rewarder(agent: AgentSpec, *, batch_size: int, std: float) -> Rewarder:
-    """Returns a rewarder of nothing; it asks for expert samples."""
+    """Returns a rewarder of zeros, which asks for expert samples."""
     del agent, std
     return Rewarder(zero_rewards, expert_batch_size=batch_size)
 
@@ -41,7 +41,7 @@ def make_rewarder(agent: AgentSpec, *, batch_size: int, std: float) -> Rewarder:
 def make_update_step(learner: Learner, *, batch_size: int, std: float) -> UpdateStep:
     """Returns the step that trains encoder and actor on the expert's actions.
 
-    Critic and rewarder stay as they were made; the agent's batch is None.
+    Critic and rewarder are not trained; the agent's batch is None.
 
     Args:
       learner: networks and hyperparameters.
@@ -77,11 +77,11 @@ def clone(
     *,
     std: float,
 ) -> tuple[TrainState, Metrics]:
-    """Steps encoder and actor towards `action` where `observation` is seen.
+    """Trains encoder and actor for one step to answer `observation` with `action`.
 
     Args:
       learner: networks and hyperparameters.
-      state: critic and rewarder are left as they are.
+      state: its critic and rewarder are not trained.
       observation: augmented. Shape [B, H, W, C] or [B, S].
       action: shape [B, A].
       std: see `losses.cloning_loss`.
@@ -91,9 +91,9 @@ def clone(
     def loss(params: tuple[Params, Params]) -> tuple[Array, Array]:
         representation = apply(encoder, params[0], observation)
         pre_tanh = apply(actor, params[1], representation)
-        negative = losses.cloning_loss(jnp.tanh(pre_tanh), action, std=std)
+        cloning = losses.cloning_loss(jnp.tanh(pre_tanh), action, std=std)
         penalty = losses.saturation_penalty(pre_tanh)
-        return negative + learner.pre_tanh_penalty * penalty, pre_tanh
+        return cloning + learner.pre_tanh_penalty * penalty, pre_tanh
 
     (value, pre_tanh), gradients = jax.value_and_grad(loss, has_aux=True)(
         (state.encoder.params, state.actor.params)

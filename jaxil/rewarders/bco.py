@@ -1,8 +1,8 @@
-"""BCO, behavioural cloning from observation: of actions that the agent infers.
+"""BCO, behavioural cloning from observation: the agent clones inferred actions.
 
 An inverse model learns from the agent's own play which action leads from one
 observation to the next, labels the demonstrations with it, and the policy clones those
-labels. Neither a reward nor a critic is involved.
+labels. There is neither a reward nor a critic.
 """
 
 import chex
@@ -54,14 +54,14 @@ def make_rewarder(
     hidden_dim: int,
     learning_rate: float,
 ) -> Rewarder:
-    """Returns a rewarder of nothing, whose state is the inverse model.
+    """Returns a rewarder of zeros, whose state is the inverse model.
 
     Args:
       agent: the inverse model has an encoder like the agent's.
       batch_size: expert samples.
       std: not used here.
       hidden_dim: width of the inverse model.
-      learning_rate: of its Adam.
+      learning_rate: of the inverse model's Adam.
     """
     del std
     model = _inverse_model(agent.networks, hidden_dim)
@@ -90,9 +90,9 @@ def make_update_step(
         min_g  mean |g(o_t, o_{t+1}) - a_t|^2          over the agent's transitions
         max_pi mean log pi(g(e_t, e_{t+1}) | e_t)      over the expert's
 
-    BCO alternates between collecting episodes and training to convergence; here both
-    go on at once, an update of each at a time, as with the other methods, so that
-    frames compare. Its play is as diverse as the run's exploration makes it.
+    BCO alternates between collecting episodes and training to convergence. Here each
+    agent update trains both once, so that frame counts compare with other methods'. How
+    diverse the play is depends on the run's exploration.
 
     Args:
       learner: networks and hyperparameters.
@@ -135,7 +135,7 @@ def make_update_step(
             learner,
             state.replace(rewarder=inverse),
             augmentation.augment(expert.observation, expert_key, padding=padding),
-            jax.lax.stop_gradient(labels),
+            labels,
             std=std,
         )
         return state, {**metrics, "inverse_model/error": error}

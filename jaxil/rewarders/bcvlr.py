@@ -2,7 +2,7 @@
 
 A latent action is what the video's next observation tells beyond the one before. The
 agent's own play tells which action each stands for, and the policy clones those.
-Neither a reward nor a critic is involved.
+There is neither a reward nor a critic.
 """
 
 import chex
@@ -118,7 +118,7 @@ def make_rewarder(
     prediction_weight: float,
     target_tau: float,
 ) -> Rewarder:
-    """Returns a rewarder of nothing, whose state is the latent-action model.
+    """Returns a rewarder of zeros, whose state is the latent-action model.
 
     Args:
       agent: the model has an encoder like the agent's.
@@ -171,21 +171,20 @@ def make_update_step(
                + mean |d(g(h(o_t), h(o_{t+1}))) - a_t|^2
         max_pi mean log pi(d(z) | e_t)
 
-    over the expert's pairs e and the agent's transitions (o, a), of which the latter
-    alone tell actions. As in the authors' code, the forward model gets the codes and
-    the decoder the latent action before it is quantised: actions are continuous.
+    over the expert's pairs e, whose actions are not read, and the agent's transitions
+    (o, a). As in the authors' code, the forward model gets the codes, but the decoder
+    the latent action before quantisation, because actions are continuous.
 
-    What differs from the publication, so that acting, evaluation and export are those
-    of every method and frames compare:
+    Differences from the publication, so that acting, evaluation and export are as for
+    every method and frame counts compare:
 
-    - It has stages: the encoder from the video by a loss of prototypes, then latent
-      actions, then, every 1000 decisions, inverse model and decoder from play and the
-      policy from the video. Here each update of the agent trains everything. Without
-      that first loss, prediction and decoder train the encoder too, and the prediction
-      so its own targets, which might shrink to a constant that is predicted without
-      error. Standard deviations of a slow copy as targets keep them from it: see
-      `losses.prediction_loss`.
-    - Its policy gives latent actions, and the decoder is behind it. Here the actor
+    - It trains in stages: the encoder on the video with a loss of prototypes, then
+      latent actions, then, every 1000 decisions, inverse model and decoder on play and
+      the policy on the video. Here each update of the agent trains everything. Without
+      the loss of prototypes, prediction and decoder train the encoder too, and the
+      prediction could shrink its own targets to a constant. The targets are therefore a
+      slow copy's features in standard deviations: see `losses.prediction_loss`.
+    - Its policy outputs latent actions, which the decoder translates. Here the actor
       regresses the decoded actions directly.
     - It moves codes to a moving average of their latents. Here `codebook_loss` does.
     - It also trains the forward model on play, with a weight of 1e-5 or 1e-3.
@@ -271,7 +270,7 @@ def make_update_step(
             metrics["latent/error"] = error
             return prediction_weight * unsupervised + error, (labels, metrics)
 
-        # The labels are those of before this step, so that the video is embedded once.
+        # Labels from before this step's update, so that the video is embedded once.
         gradients, (labels, metrics) = jax.grad(loss, has_aux=True)(
             state.rewarder.live.params
         )

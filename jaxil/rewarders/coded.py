@@ -1,4 +1,4 @@
-"""What methods share that compare episodes under a fixed code of the pixels."""
+"""Rewarders that compare episodes under a fixed code of the pixels."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from jaxil.rewarders.comparison import Compare, make_comparing_rewarder
 
 
 class CodedState(struct.PyTreeNode):
-    """What such a method remembers between episodes.
+    """What such a rewarder remembers between episodes.
 
     Attributes:
       code: fitted to the demonstrations and the first episode, then fixed.
@@ -36,8 +36,7 @@ def make_coded_rewarder(
 ) -> Rewarder:
     """Returns a rewarder of whole episodes under principal components of the frames.
 
-    Nothing that the agent learns changes the code, so a reward, once given, is right
-    for good.
+    Nothing that the agent learns changes the code, so stored rewards stay valid.
 
     Args:
       agent: only its frame stack is used.
@@ -63,7 +62,7 @@ def make_coded_rewarder(
             scale=jnp.zeros(()),
         )
 
-    def look(
+    def update_features(
         state: CodedState,
         learner: LearnerParams,
         episode: Episode,
@@ -85,7 +84,7 @@ def make_coded_rewarder(
 
     return make_comparing_rewarder(
         init=init,
-        look=look,
+        update_features=update_features,
         embed=lambda state, frames: codes.encode_episode(
             state.code, frames, frame_stack=frame_stack
         ),

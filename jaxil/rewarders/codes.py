@@ -10,17 +10,17 @@ from jaxil.maths import components, stacking
 from jaxil.maths.types import Episode, ExpertEpisodes
 from jaxil.rewarders.discrimination import scaled
 
-# With the usual four episodes before the first update, both weigh alike.
+# Four episodes, usual before the first update, weigh as much as all demonstrations.
 _DEMONSTRATION_ROWS, _EPISODE_ROWS = 1024, 256
 _NORM = 8.0  # of an observation's code, root mean square: penalties depend on it
-_SMALLEST_SCALE = 1e-3  # below it is rounding, which must not be magnified
+_SMALLEST_SCALE = 1e-3  # anything smaller is rounding, which must not be magnified
 
 
 class FrameCode(struct.PyTreeNode):
-    """Principal components of demonstrations and of play before the first update.
+    """Principal components of demonstrations and of the agent's first episodes.
 
-    Fitted again by each episode until `is_fixed`, since what judges needs inputs that
-    keep their meaning. Play adds poses that no demonstration has.
+    Each episode refines it until `is_fixed`: rewards need features that keep their
+    meaning. The agent's episodes add poses that no demonstration has.
 
     Attributes:
       mean: of demonstrations' frames, in [0, 1]. Shape [P], with P = H W 3.
@@ -57,7 +57,7 @@ def observe(code: FrameCode, episode: Episode, experts: ExpertEpisodes) -> Frame
 
 
 def fit(code: FrameCode, episode: Episode, experts: ExpertEpisodes) -> FrameCode:
-    """Returns the code fitted to one more episode, and first to the demonstrations."""
+    """Returns the code fitted to one more episode; a new one also to demonstrations."""
     code = jax.lax.cond(
         code.num_rows == 0.0, lambda: _begin(code, experts), lambda: code
     )
@@ -65,14 +65,14 @@ def fit(code: FrameCode, episode: Episode, experts: ExpertEpisodes) -> FrameCode
 
 
 def fix(code: FrameCode) -> FrameCode:
-    """Returns the code as it stays from now on."""
+    """Returns the code, which `observe` leaves as it is from now on."""
     return code.replace(is_fixed=jnp.ones((), bool))
 
 
 def encode_frames(code: FrameCode, frames: Array) -> Array:
     """Returns the codes of frames: [M, H, W, 3] to [M, J].
 
-    NaN before the first episode, so that a loop without `observe` ends at once.
+    NaN before the first episode, so that a loop that forgets `observe` fails at once.
     """
     scale = jnp.sqrt(jnp.sum(code.sketch**2) / code.num_rows)
     codes = components.project(_rows(frames) - code.mean[None], code.sketch)

@@ -1,9 +1,8 @@
-"""What methods share that compare a whole episode with demonstrations."""
+"""Rewarders that compare a whole episode with the demonstrations."""
 
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -12,16 +11,16 @@ from jaxil.learner.state import LearnerParams
 from jaxil.maths.types import Episode, ExpertEpisodes
 from jaxil.rewarders.matching import scale_of_first_episode
 
-# (agent features [T + 1, D], expert features [K, N + 1, D], frames of each that are its
-# own [K]) -> rewards [T + 1] of o_0 ... o_T, or a plan [T + 1, N + 1] and the index of
-# its demonstration.
+# (agent features [T + 1, D], expert features [K, N + 1, D], their lengths without
+# padding [K]) -> rewards [T + 1] of o_0 ... o_T, or a plan [T + 1, N + 1] and the index
+# of its demonstration.
 Compare = Callable[[Array, Array, Array], Any]
 
 
 def make_comparing_rewarder(
     *,
     init: Callable[..., Any],
-    look: Callable[[Any, LearnerParams, Episode, ExpertEpisodes], Any],
+    update_features: Callable[[Any, LearnerParams, Episode, ExpertEpisodes], Any],
     embed: Callable[[Any, Array], Array],
     compare: Compare,
     plan: Compare | None,
@@ -31,13 +30,13 @@ def make_comparing_rewarder(
     """Returns a rewarder of whole episodes under some features.
 
     Its state is a PyTreeNode with at least `expert_features`, the demonstrations'
-    features [K, N + 1, D], and `scale`, the factor on rewards: [], 0 before the first
-    episode sets it, or 1 for good without `return_scale`.
+    features [K, N + 1, D], and `scale`, the factor on rewards [], which is 0 before the
+    first episode, or always 1 without `return_scale`.
 
     Args:
       init: see `Rewarder`.
-      look: (state, learner, episode, demonstrations) -> state; may change what features
-        are, at each episode's end and before it is rewarded.
+      update_features: (state, learner, episode, demonstrations) -> state; may change
+        what `embed` returns, at each episode's end and before it is rewarded.
       embed: (state, frames [T + 1, ...]) -> features [T + 1, D].
       compare: features to rewards, before scaling.
       plan: the transport plan behind them; None without one.
@@ -46,24 +45,21 @@ def make_comparing_rewarder(
       rewards_changed: see `Rewarder`.
     """
 
-    def unscaled(
-        compared: Compare,
+    def compare_with(
+        function: Compare,
         state: Any,
         episode: Episode,
         expert_episodes: ExpertEpisodes | None,
     ) -> Any:
         assert expert_episodes is not None
         features = embed(state, jnp.asarray(episode.frames))
-        return compared(features, state.expert_features, expert_episodes.num_frames)
+        return function(features, state.expert_features, expert_episodes.num_frames)
 
-    def scaled(state: Any, episode: Episode, expert_episodes: ExpertEpisodes) -> Any:
-        def first_scale() -> Array:
-            assert return_scale is not None
-            rewards = unscaled(compare, state, episode, expert_episodes)[1:]
-            return scale_of_first_episode(rewards, return_scale)
-
-        scale = jax.lax.cond(state.scale > 0.0, lambda: state.scale, first_scale)
-        return state.replace(scale=scale)
+    def unscaled(
+        state: Any, episode: Episode, expert_episodes: ExpertEpisodes | None
+    ) -> Array:
+        # Reward t is that of o_{t+1}.
+        return compare_with(compare, state, episode, expert_episodes)[1:]
 
     def observe(
         state: Any,
@@ -72,10 +68,15 @@ def make_comparing_rewarder(
         expert_episodes: ExpertEpisodes | None,
     ) -> Any:
         assert expert_episodes is not None
-        state = look(state, learner, episode, expert_episodes)
+        state = update_features(state, learner, episode, expert_episodes)
         if return_scale is None:
             return state
-        return scaled(state, episode, expert_episodes)
+        scale = scale_of_first_episode(
+            state.scale,
+            lambda: unscaled(state, episode, expert_episodes),
+            return_scale,
+        )
+        return state.replace(scale=scale)
 
     def rewards(
         state: Any,
@@ -84,8 +85,7 @@ def make_comparing_rewarder(
         expert_episodes: ExpertEpisodes | None,
     ) -> Array:
         del learner
-        # Reward t is that of o_{t+1}.
-        return state.scale * unscaled(compare, state, episode, expert_episodes)[1:]
+        return state.scale * unscaled(state, episode, expert_episodes)
 
     def plan_of(
         state: Any,
@@ -95,7 +95,7 @@ def make_comparing_rewarder(
     ) -> tuple[Array, Array]:
         del learner
         assert plan is not None
-        return unscaled(plan, state, episode, expert_episodes)
+        return compare_with(plan, state, episode, expert_episodes)
 
     return Rewarder(
         rewards,

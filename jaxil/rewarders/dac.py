@@ -53,12 +53,12 @@ def make_rewarder(
 
         r_t = logit D(o_t, a_t)
 
-    D has a separate encoder, sees pixels that are not augmented and the expert's
-    actions, and rewards are recomputed for every batch: three differences from P-DAC.
-    Its gradient penalty is on pixels and actions.
+    It differs from P-DAC in three ways: D has a separate encoder, it sees the expert's
+    actions and pixels that are not augmented, and rewards are recomputed for every
+    batch. The gradient penalty is on pixels and actions.
 
     Args:
-      agent: the discriminator's encoder is made like its own.
+      agent: the discriminator's encoder has the architecture of its encoder.
       hidden_dim: width of the discriminator.
       learning_rate: of its Adam.
       gradient_penalty: its weight.
@@ -129,9 +129,5 @@ def make_rewarder(
         return logits(state.params, x)
 
     return Rewarder(
-        rewards,
-        init,
-        update,
-        expert_batch_size=batch_size,
-        relabel=relabel,
+        rewards, init, update, expert_batch_size=batch_size, relabel=relabel
     )

@@ -1,4 +1,4 @@
-"""What methods with a discriminator share: its step, and rewards of transitions."""
+"""Shared by adversarial methods: the discriminator's step, rewards of transitions."""
 
 from collections.abc import Callable
 from typing import Any
@@ -29,9 +29,9 @@ from jaxil.maths.types import (
 )
 from jaxil.networks.encoder import PixelEncoder
 
-# Parameters and inputs to logits: [B], or [B, P] of P parts of the input.
+# Parameters and inputs to logits: [B], or [B, P] if each part of an input has one.
 Logits = Callable[[Params, Any], Array]
-Pair = tuple[Array, Array]  # of what is seen of o_t and of o_{t+1}
+Pair = tuple[Array, Array]  # discriminator inputs from o_t and from o_{t+1}
 
 
 def update_discriminator(
@@ -48,12 +48,12 @@ def update_discriminator(
 
         max_D  mean log D(e) + mean log(1 - D(a)) - penalty_weight * GP
 
-    Where an input has logits of several parts, means are over these too, and the
-    penalty is on the mean logit.
+    Where an input has several logits, means are over these too, and the penalty is on
+    the mean logit.
 
     Args:
       state: the discriminator.
-      logits: its function.
+      logits: maps parameters and inputs to logits.
       expert: inputs of demonstrations, a pytree of float arrays [B, ...].
       agent: the same of the agent. No gradient flows into either.
       key: consumed.
@@ -91,7 +91,7 @@ def mean_logit(logits: Array) -> Array:
 
 
 def scaled(observation: Data) -> Array:
-    """Returns pixels in [0, 1], for which penalties are meant; states as they are."""
+    """Returns pixels in [0, 1], as gradient penalties assume; states as they are."""
     observation = jnp.asarray(observation)
     if observation.ndim == 2:
         return observation
@@ -99,7 +99,7 @@ def scaled(observation: Data) -> Array:
 
 
 def unscaled(x: Array) -> Array:
-    """Returns what encoders take for what `scaled` returned."""
+    """Undoes `scaled`: returns pixels in [0, 255], as encoders take them."""
     return x if x.ndim == 2 else 255.0 * x
 
 
@@ -113,8 +113,8 @@ def make_transition_rewarder(
     agent: AgentSpec,
     *,
     init_params: Callable[[Array, Spec], Params],
-    see: Callable[[LearnerParams, Array], Array],
-    seen: Callable[[AgentView], tuple[Array | None, Array | None]],
+    inputs: Callable[[LearnerParams, Array], Array],
+    agent_inputs: Callable[[AgentView], tuple[Array | None, Array | None]],
     logits: Logits,
     reward: Callable[[RewarderState, Array], Array],
     learning_rate: float,
@@ -126,20 +126,20 @@ def make_transition_rewarder(
 
         r_t = reward(logits D(x_t, x_{t+1}))
 
-    with what is seen of an observation, x = see(o). D is trained on augmented
-    observations; what it rewards is not augmented.
+    where x = inputs(o). D is trained on augmented observations, but rewards are of
+    observations without augmentation.
 
     Args:
-      agent: of the run.
+      agent: its frame stack and shift are used.
       init_params: (key, spec) -> parameters of D.
-      see: (learner, observations [M, ...]) -> x [M, ...].
-      seen: (view) -> the agent's x_t and x_{t+1}, [B, ...].
+      inputs: (learner, observations [M, ...]) -> x [M, ...].
+      agent_inputs: (view) -> the agent's x_t and x_{t+1}, [B, ...].
       logits: (parameters, (x_t, x_{t+1})) -> logits [M], or [M, P].
       reward: (state, logits) -> rewards [M]; the state has D's parameters.
       learning_rate: of D's Adam.
       gradient_penalty: its weight.
       batch_size: expert samples, and agent samples, in an update.
-      relabels: whether rewards are those of now in every batch; otherwise they are
+      relabels: whether rewards are recomputed for every batch; otherwise they are
         stored.
     """
     optimiser = optax.adam(learning_rate)
@@ -165,10 +165,10 @@ def make_transition_rewarder(
             state,
             logits,
             tuple(
-                see(learner, augmentation.augment(o, k, padding=agent.shift_padding))
+                inputs(learner, augmentation.augment(o, k, padding=agent.shift_padding))
                 for o, k in pairs
             ),
-            jax.tree.map(lambda x: x[:batch_size], seen(view)),
+            jax.tree.map(lambda x: x[:batch_size], agent_inputs(view)),
             penalty_key,
             penalty_weight=gradient_penalty,
             optimiser=optimiser,
@@ -181,10 +181,10 @@ def make_transition_rewarder(
         expert_episodes: ExpertEpisodes | None,
     ) -> Array:
         del expert_episodes
-        x = see(
-            learner,
-            stacking.stack_frames(episode.frames, frame_stack=agent.frame_stack),
+        observations = stacking.stack_frames(
+            episode.frames, frame_stack=agent.frame_stack
         )
+        x = inputs(learner, observations)
         return reward(state, logits(state.params, (x[:-1], x[1:])))
 
     def relabel(state: ModuleState, learner: LearnerParams, batch: Batch) -> Array:
@@ -194,7 +194,7 @@ def make_transition_rewarder(
         moments = [window.observation, batch.next_observation[:, None]]
         moments = jnp.concatenate(moments, axis=1)  # [B, n + 1, ...]
         size = moments.shape[:2]
-        x = see(learner, moments.reshape(-1, *moments.shape[2:]))
+        x = inputs(learner, moments.reshape(-1, *moments.shape[2:]))
         x = x.reshape(*size, *x.shape[1:])
         pair = (y.reshape(-1, *y.shape[2:]) for y in (x[:, :-1], x[:, 1:]))
         judged = reward(state, logits(state.params, tuple(pair)))

@@ -18,7 +18,7 @@ METHOD = methods.Method(
 
 
 def make_rewarder(agent: AgentSpec) -> Rewarder:
-    """Returns the environment's own reward, which makes the learner DrQ-v2."""
+    """Returns a rewarder of the environment's own rewards."""
     del agent
 
     def rewards(

@@ -41,18 +41,19 @@ def make_rewarder(
 
         r_t = logit D(o_t, o_{t+1})
 
-    It differs from DAC in that D judges the next observation instead of the action, and
-    is trained on augmented pixels; `shift_padding=0` leaves them as they are. Its
-    gradient penalty is on both observations.
+    It differs from DAC in that D sees the next observation instead of the action, and
+    is trained on augmented pixels unless `shift_padding` is 0. The gradient penalty is
+    on both observations.
 
     Args:
-      agent: the discriminator's encoder is made like its own.
+      agent: the discriminator's encoder has the architecture of its encoder.
       hidden_dim: width of the discriminator.
-      learning_rate: this and the others: see `make_transition_rewarder`.
+      learning_rate, gradient_penalty, batch_size, relabels: see
+        `make_transition_rewarder`.
 
     Source: Torabi et al. 2018, Generative Adversarial Imitation from Observation,
     arXiv:1807.06158; off policy as in Kostrikov et al. 2019, arXiv:1809.02925;
-    augmented as PatchAIL's baseline with an independent encoder is.
+    augmented as in PatchAIL's baseline with an independent encoder.
     """
     discriminator = TransitionDiscriminator(
         separate_encoder(agent), agent.feature_dim, hidden_dim
@@ -68,8 +69,8 @@ def make_rewarder(
     return make_transition_rewarder(
         agent,
         init_params=init_params,
-        see=lambda learner, observation: scaled(observation),
-        seen=lambda view: (scaled(view.observation), scaled(view.successor)),
+        inputs=lambda learner, observation: scaled(observation),
+        agent_inputs=lambda view: (scaled(view.observation), scaled(view.successor)),
         logits=logits,
         reward=lambda state, logits: logits,
         learning_rate=learning_rate,

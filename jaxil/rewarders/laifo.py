@@ -54,27 +54,26 @@ def make_rewarder(
 
         r_t = 1 if logit D(z_t, z_{t+1}) > 0 else 0
 
-    with critic-trunk features z, without gradient into encoder or trunk.
+    where z are the critic trunk's features, without gradient into encoder or trunk.
 
     Args:
       agent: only its encoder and the critic's trunk are used.
       hidden_dim: width of the discriminator.
-      learning_rate: this and those that are not named here: see
+      learning_rate, gradient_penalty, batch_size, relabels: see
         `make_transition_rewarder`.
       reward: "decision", the equation above, or "logit", the logit itself.
 
     Source: Giammarino et al. 2024, Adversarial Imitation Learning from Visual
     Observations using Latent Information, arXiv:2309.17371, and its code,
     VittorioGiammarino/AIL_from_visual_obs. There, actor and critic share one trunk,
-    and one transition over n steps is judged where returns are of n steps; here each
-    of its steps is.
+    and an n-step return judges one transition over all n steps; here, each single step.
     """
     discriminator = Discriminator(hidden_dim)
 
     def init_params(key: Array, spec: Spec) -> Params:
         return discriminator.init(key, jnp.zeros((1, 2 * agent.feature_dim)))
 
-    def see(learner: LearnerParams, observation: Array) -> Array:
+    def inputs(learner: LearnerParams, observation: Array) -> Array:
         return critic_features(
             agent.networks, learner.encoder, learner.critic, observation
         )
@@ -89,8 +88,8 @@ def make_rewarder(
     return make_transition_rewarder(
         agent,
         init_params=init_params,
-        see=see,
-        seen=lambda view: (view.features, view.successor_features),
+        inputs=inputs,
+        agent_inputs=lambda view: (view.features, view.successor_features),
         logits=logits,
         reward=rewarded,
         learning_rate=learning_rate,

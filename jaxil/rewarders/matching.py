@@ -1,4 +1,4 @@
-"""Which moments of two episodes belong together, and what the match is worth."""
+"""Which moments of two episodes are paired, and the rewards of that pairing."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -18,8 +18,8 @@ class Matching(NamedTuple):
 
     Attributes:
       cost: features [T, D] and [N, D] to costs [T, N].
-      plan: costs [T, N] and what each of the expert's moments carries, [N], to a plan
-        [T, N] whose rows carry 1/T each.
+      plan: costs [T, N] and masses of the expert's moments [N] to a plan [T, N], each
+        row of which has mass 1/T.
     """
 
     cost: Callable[[Array, Array], Array]
@@ -31,7 +31,7 @@ class Matching(NamedTuple):
         Args:
           agent: features of an episode. Shape [T, D].
           experts: features of the demonstrations. Shape [K, N, D].
-          num_moments: how many of the N are a demonstration's own. Shape [K].
+          num_moments: how many of a demonstration's N are not padding. Shape [K].
 
         Returns:
           Rewards of the agent's T observations, see `closest_rewards`. Shape [T].
@@ -68,12 +68,12 @@ def closest_rewards(costs: Array, plans: Array) -> Array:
         k* = argmin_k <C_k, P_k>,    r_t = - sum_n C_k*tn P_k*tn
 
     The paper compares entropic distances; the reference compares transport costs
-    without their entropy, as here. At epsilon 0.01 the two choose alike but for near
-    ties: 1 of 40 draws of near-identical demonstrations differed.
+    without the entropy, as here. At epsilon 0.01 the two differ only in near ties: in 1
+    of 40 draws of near-identical demonstrations.
 
     Args:
       costs: one matrix for each demonstration. Shape [K, T, N].
-      plans: what is carried where. Shape [K, T, N].
+      plans: one for each demonstration. Shape [K, T, N].
 
     Returns:
       Rewards of the agent's T observations. Shape [T].
@@ -85,15 +85,23 @@ def closest_rewards(costs: Array, plans: Array) -> Array:
     return candidates[jnp.argmax(jnp.sum(candidates, axis=1))]
 
 
-def scale_of_first_episode(unscaled: Array, return_scale: float) -> Array:
-    """Returns the factor that gives an episode the return `-return_scale`.
+def scale_of_first_episode(
+    scale: Array, unscaled: Callable[[], Array], return_scale: float
+) -> Array:
+    """Returns the factor that gives the first episode the return `-return_scale`.
 
     Args:
-      unscaled: its rewards. Shape [T].
+      scale: returned as it is unless it is 0, as before the first episode. Shape [].
+      unscaled: returns the episode's rewards [T].
       return_scale: 10 in the paper.
     """
-    chex.assert_rank(unscaled, 1)
-    return return_scale / jnp.maximum(-jnp.sum(unscaled), _COST_FLOOR)
+
+    def first() -> Array:
+        rewards = unscaled()
+        chex.assert_rank(rewards, 1)
+        return return_scale / jnp.maximum(-jnp.sum(rewards), _COST_FLOOR)
+
+    return jax.lax.cond(scale > 0.0, lambda: scale, first)
 
 
 def make_matching(

@@ -21,7 +21,7 @@ METHOD = methods.Method(
             "temperature": methods.Field(
                 1.0, "of costs turned into probabilities; 1 in the paper", 1e-3, 1e3
             ),
-            # A product over all 501 frames of ours would be 0; theirs are short.
+            # The authors' demonstrations are short; a product over our 501 would be 0.
             "num_waypoints": methods.Field(
                 20, "evenly spaced frames of a demonstration to be covered", 2, 10_000
             ),
@@ -40,11 +40,12 @@ def make_rewarder(
 ) -> Rewarder:
     """Returns the rewarder of ORCA.
 
-        r_t = probability that o_0 ... o_t have covered the demonstration in its order
-              and that o_t covers its end
+        r_t = probability that o_0 ... o_{t+1} have covered the demonstration in its
+              order and that o_{t+1} covers its end
 
-    of cosine costs between features of P-SIL's target copies, see `coverage_rewards`;
-    to the demonstration with the largest return. Rewards are in [0, 1] and not scaled.
+    from cosine costs between features of P-SIL's target copies, see `coverage_rewards`.
+    The demonstration with the largest return counts. Rewards are in [0, 1] and not
+    scaled.
 
     Args:
       agent: its encoder, actor's trunk and frame stack are used.
@@ -53,13 +54,13 @@ def make_rewarder(
       target_update_steps: agent steps between target copies.
 
     Source: Huey et al. 2025, Imitation Learning from a Single Temporally Misaligned
-    Video; portal-cornell/orca. The paper has one demonstration, all of whose frames
-    are to be covered.
+    Video; portal-cornell/orca. The paper has one demonstration, and all its frames
+    have to be covered.
     """
 
     def compare(agent: Array, experts: Array, num_moments: Array) -> Array:
-        def rewards(expert: Array, own: Array) -> Array:
-            chosen = expert[waypoints(own, num_waypoints)]
+        def rewards(expert: Array, length: Array) -> Array:
+            chosen = expert[waypoints(length, num_waypoints)]
             cost = transport.cosine_cost(agent, chosen)
             return coverage_rewards(cost, temperature=temperature)
 
@@ -79,8 +80,8 @@ def waypoints(num_moments: Array, num_waypoints: int) -> Array:
     """Returns indices of evenly spaced moments, the first and the last among them.
 
     Args:
-      num_moments: how many moments are the expert's own. Shape [].
-      num_waypoints: at least 2; beyond `num_moments`, some are there more than once.
+      num_moments: the expert's moments, without padding. Shape [].
+      num_waypoints: at least 2; if above `num_moments`, some are repeated.
 
     Returns:
       int32, ascending. Shape [num_waypoints].
@@ -98,11 +99,11 @@ def coverage_rewards(cost: Array, *, temperature: float) -> Array:
         cov_tn = max(cov_{t-1,n}, cov_{t,n-1} p_tn)
         r_t = cov_{t,N-2} p_{t,N-1}
 
-    The last moment has no max: whoever leaves it earns less.
+    with cov_{-1,n} = 0. The last moment has no max: an agent that leaves it earns less.
 
     Args:
       cost: C >= 0. Shape [T, N], with N >= 2.
-      temperature: larger ones forgive distance.
+      temperature: the larger, the less distance matters.
 
     Returns:
       Rewards in [0, 1]. Shape [T].

@@ -61,8 +61,8 @@ class SimilarityState(ModuleState):
     """The discriminator, and what similarity is measured with.
 
     Attributes:
-      expert_patches: probabilities of the expert's patches, summing to one, in the mean
-        over the last update's samples. Shape [P].
+      expert_patches: D of the expert's patches, averaged over the last update's samples
+        and normalised to sum to one. Shape [P].
       scale: lambda, set by the first episode; 0 before. Shape [].
     """
 
@@ -86,18 +86,19 @@ def make_rewarder(
         weighted   r_t = s_t m_t
         bonus      r_t = 0.5 m_t + s_t
 
-    with s_t = lambda `patch_similarity`, where lambda makes the first episode's mean s
-    1.3 (weighted) or 0.5 (bonus). The penalty is on the mean logit.
+    where s_t is lambda times `patch_similarity`, and lambda makes the first episode's
+    mean s 1.3 (weighted) or 0.5 (bonus). The penalty is on the mean logit.
 
     Args:
-      agent: of the run.
-      variant: one of these names.
+      agent: its frame stack and shift are used.
+      variant: "plain", "weighted" or "bonus".
       width: see `PatchDiscriminator`.
-      learning_rate: this and the others: see `make_transition_rewarder`.
+      learning_rate, gradient_penalty, batch_size, relabels: see
+        `make_transition_rewarder`.
 
     Source: Liu et al. 2023, Visual Imitation Learning with Patch Rewards,
-    arXiv:2302.00965, and its code, sail-sg/PatchAIL, where lambda is set by the first
-    batch, and s is that of the agent step's batch also where the logits are stored.
+    arXiv:2302.00965, and its code, sail-sg/PatchAIL, where the first batch sets lambda,
+    and every update recomputes s for its batch although the logits are stored.
     """
     discriminator = PatchDiscriminator(width)
 
@@ -121,8 +122,8 @@ def make_rewarder(
     plain = make_transition_rewarder(
         agent,
         init_params=init_params,
-        see=lambda learner, observation: scaled(observation),
-        seen=lambda view: (scaled(view.observation), scaled(view.successor)),
+        inputs=lambda learner, observation: scaled(observation),
+        agent_inputs=lambda view: (scaled(view.observation), scaled(view.successor)),
         logits=logits,
         reward=reward,
         learning_rate=learning_rate,
@@ -183,12 +184,12 @@ def make_rewarder(
 
 
 def patch_similarity(logits: Array, expert_patches: Array) -> Array:
-    """Returns how much like the expert's the distribution over patches is.
+    """Returns how similar distributions over patches are to the expert's.
 
         exp(-KL(p | q)),    p = D / sum over patches of D,    D = sigmoid(logits)
 
     Args:
-      logits: of one discriminator. Shape [B, P].
+      logits: of the agent's patches. Shape [B, P].
       expert_patches: q, positive and summing to one. Shape [P].
 
     Returns:

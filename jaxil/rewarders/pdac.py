@@ -55,15 +55,15 @@ def make_rewarder(
 ) -> Rewarder:
     """Returns the rewarder of P-DAC.
 
-        r = logit D(e)
+        r_t = logit D(x_{t+1})
 
-    where D, see `update_discriminator`, judges critic-trunk features e of augmented
-    observations, without gradient into encoder or trunk. log D - log(1 - D), the
-    paper's reward, is the logit itself, and only the logit stays finite in float32.
+    where x are the critic trunk's features, without gradient into encoder or trunk. D
+    is trained on augmented observations, see `update_discriminator`. The paper's reward
+    log D - log(1 - D) is the logit itself, and only the logit stays finite in float32.
 
-    With `num_components`, e is `codes.encode` of observations without augmentation. It
-    does not change, so what a reward means does not either, and it knows of the whole
-    image from the start; the critic's features know of what rewards have taught.
+    With `num_components`, x is `codes.encode` of observations without augmentation. It
+    shows the whole image from the start and does not change, whereas the critic's
+    features show what rewards have taught so far.
 
     Args:
       agent: its encoder, critic's trunk, frame stack and shift are used.
@@ -71,12 +71,12 @@ def make_rewarder(
       learning_rate: of its Adam.
       gradient_penalty: its weight.
       batch_size: expert samples, and agent samples, in an update.
-      sees_actions: whether actions are appended to the features: D(o_t, a_t).
-      num_components: of each frame; 0, the paper's: the critic's features. State
-        vectors have no code, and their features are judged.
+      sees_actions: whether actions are appended to the features: D(x_t, a_t).
+      num_components: of each frame; 0, the paper's: the critic's features, as always
+        for state vectors, which have no code.
 
     Source: Cohen et al. 2021, sec. 3.2; sizes and rates, which the paper leaves
-    out, from siddhanthaldar/ROT. The code is this project's own.
+    out, from siddhanthaldar/ROT. The code of pixels is this project's own.
     """
     discriminator = Discriminator(hidden_dim)
     optimiser = optax.adam(learning_rate)
@@ -139,11 +139,11 @@ def make_rewarder(
             )
             features = view.features[:batch_size]
         else:
-            # Not augmented: a shift would move the code, and the code is all there is.
+            # Not augmented: a shift would change the code, which is all that D sees.
             expert_features = encode(code, jnp.asarray(expert.observation))
             features = encode(code, view.unshifted[:batch_size])
             code = codes.fix(code)
-        judged, metrics = update_discriminator(
+        state, metrics = update_discriminator(
             state,
             logits,
             inputs(expert_features, expert.action),
@@ -152,7 +152,7 @@ def make_rewarder(
             penalty_weight=gradient_penalty,
             optimiser=optimiser,
         )
-        return judged.replace(code=code), metrics
+        return state.replace(code=code), metrics
 
     def features_of(state: JudgeState, learner: LearnerParams, frames: Array) -> Array:
         if state.code is not None:

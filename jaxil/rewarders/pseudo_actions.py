@@ -1,4 +1,4 @@
-"""Cloning of inferred actions, beside the rewards of any other method.
+"""Cloning of inferred actions, added to any method that rewards.
 
 Inverse models learn from the agent's own play which action leads from one observation
 to the next, as in BCO, and infer the actions of the expert's video. The actor then
@@ -74,13 +74,13 @@ def with_cloning(
 
     with the trust w in a label and s = mean |Q| of the agent's samples, without
     gradient, so that the term's share does not depend on the scale of rewards. The
-    inverse models have an encoder of their own. The expert's actions are not read here;
-    whether the inner method reads them is its own affair.
+    inverse models have an encoder of their own. The expert's actions are not read here,
+    but the inner method may read them.
 
-    Expert samples are those that the inner method asks for, or `num_pairs` if that is
-    more, and each of both uses the first rows. The inner method is given the random
-    keys, samples and states that it would have alone; with weight 0 the agent learns
-    as it would with the inner method, but for rounding.
+    An update gets as many expert samples as the inner method asks for, or `num_pairs`
+    if that is more; each uses the first rows. The inner method is given the random
+    keys, samples and states that it would have alone: with weight 0 the agent learns as
+    with the inner method, but for rounding.
 
     Args:
       rewarder: the inner method.
@@ -88,16 +88,16 @@ def with_cloning(
       num_pairs: expert transitions whose pseudo-actions are cloned in an update.
       weight: of the term.
       trust: "agreement": `cloning.agreement_trust`; "q_filter": `cloning.q_filter`,
-        by the critic as the actor's loss sees it; "none": 1.
+        by the critic that the actor's loss uses; "none": 1.
       trust_scale: of "agreement"; models that have learned nothing are about 0.05
-        apart, on two actions as on six, and so are hardly trusted with 0.01.
+        apart, with two actions as with six, so at 0.01 they are hardly trusted.
       num_models: M, inverse models; they share encoder and embedding.
       head_dim: width of their separate heads.
       model_learning_rate: of their Adam.
 
     Source: Torabi et al. 2018, arXiv:1805.01954, for pseudo-actions; ROT
-    (siddhanthaldar/ROT) for cloning beside rewards by imitation, of actions that are
-    known there. The combination is this project's own.
+    (siddhanthaldar/ROT), where the expert's actions are known, for cloning beside
+    imitation rewards. The combination is this project's own.
     """
     encoder, actor, critic = agent.networks
     models = InverseModels(
@@ -202,7 +202,7 @@ def with_cloning(
             )
         else:
             trusted = jnp.ones(num_pairs)
-        # The features are one update older than the rest: for a scale that is enough.
+        # These features are from before this update; for a scale that is enough.
         scale = cloning.value_scale(values(view.features, view.action))
         term = weight * scale * cloning.trusted_cloning_loss(action, label, trusted)
         if rewarder.actor_loss is None:

@@ -35,12 +35,13 @@ def make_rewarder(
 ) -> Rewarder:
     """Returns the rewarder of P-SIL.
 
-        r_t = - scale * sum_n C_tn P_tn,    C = cosine distance, P = Sinkhorn plan
+        r_t = - scale * sum_n C_{t+1,n} P_{t+1,n}
 
-    between features of target copies of the actor's trunk on the encoder, or with
-    `num_components` between codes of the pixels, to the demonstration that is cheapest
-    to reach. State vectors have no code, and their features are compared. For the
-    arguments see `make_matching`, `make_target_rewarder` and `make_coded_rewarder`.
+    with cosine distances C and the Sinkhorn plan P to the demonstration that is
+    cheapest to reach. Compared are features of target copies of the encoder and the
+    actor's trunk or, with `num_components`, codes of the pixels; state vectors have no
+    code, so always their features. For the arguments see `make_matching`,
+    `make_target_rewarder` and `make_coded_rewarder`.
 
     Source: Cohen et al. 2021, sec. 3.1, eqs. (1) to (5); epsilon, iterations and
     the copied trunk, which the paper leaves out, from siddhanthaldar/ROT.

@@ -67,27 +67,24 @@ def make_rewarder(
 ) -> Rewarder:
     """Returns the rewarder of SIL, extended to pixels.
 
-        max_f  <C_f, P_f>,    r_t = - scale * sum_n C_tn P_tn
+        max_f  <C_f, P_f>,    r_t = - scale * sum_n C_{t+1,n} P_{t+1,n}
 
     The embedding f, with a separate encoder, is trained to maximise the Sinkhorn
-    distance between a batch of the agent's observations and one of the expert's; an
-    episode is rewarded by the live f, without a target copy, as in P-SIL otherwise.
-    Pixels are not augmented.
+    distance between a batch of the agent's observations and one of the expert's.
+    Rewards are as in P-SIL, but under the live f, without a target copy. Pixels are
+    not augmented.
 
     Args:
-      agent: the embedding's encoder is made like its own.
-      cost: these four: see `make_matching`.
-      alignment: see there.
-      epsilon: see there.
-      num_iterations: see there.
+      agent: the embedding's encoder has the architecture of its encoder.
+      cost, alignment, epsilon, num_iterations: see `make_matching`.
       return_scale: the first episode returns minus this.
       learning_rate: of the embedding's Adam.
       batch_size: expert samples, and agent samples, in an update.
 
     Source: Papagiannis and Li 2020, arXiv:2008.09167, sec. 3, on pixels as in Cohen
     et al. 2021, sec. 4.1. The original differs in more than pixels: it embeds whole
-    episodes, on policy, into 10 linear outputs, at a learning rate of 5e-4. Batches,
-    as discriminators have, give the off-policy learner one step of f per update.
+    episodes, on policy, into 10 linear outputs, at a learning rate of 5e-4. Here the
+    learner is off policy, and each update trains f for one step on batches.
     """
     matching = make_matching(
         cost=cost, alignment=alignment, epsilon=epsilon, num_iterations=num_iterations
@@ -149,12 +146,10 @@ def make_rewarder(
         expert_episodes: ExpertEpisodes | None,
     ) -> SilState:
         del learner
-        scale = jax.lax.cond(
-            state.scale > 0.0,
-            lambda: state.scale,
-            lambda: scale_of_first_episode(
-                unscaled(state, episode, expert_episodes), return_scale
-            ),
+        scale = scale_of_first_episode(
+            state.scale,
+            lambda: unscaled(state, episode, expert_episodes),
+            return_scale,
         )
         return state.replace(scale=scale)
 
@@ -191,12 +186,12 @@ def make_rewarder(
 
 
 def batch_distance(matching: Matching, agent: Array, expert: Array) -> Array:
-    """Returns the transport cost between two batches of features, to be ascended.
+    """Returns the transport cost between two batches of features, to be maximised.
 
         <C, P>   with the gradient   sum_tn P_tn dC_tn
 
-    At its optimum the plan answers to first order for nothing (Danskin's theorem), so
-    no gradient passes through Sinkhorn's iterations.
+    The plan has no gradient: by Danskin's theorem the one above is that of the entropic
+    distance at the optimal plan, so Sinkhorn's iterations are not differentiated.
 
     Args:
       matching: cost and plan.
@@ -205,7 +200,6 @@ def batch_distance(matching: Matching, agent: Array, expert: Array) -> Array:
     """
     chex.assert_rank([agent, expert], 2)
     cost = matching.cost(agent, expert)
-    whole = jnp.asarray(expert.shape[0])
-    mass = transport.uniform_mass(whole, expert.shape[0])
+    mass = transport.uniform_mass(jnp.asarray(len(expert)), len(expert))
     plan = matching.plan(jax.lax.stop_gradient(cost), mass)
     return jnp.sum(cost * jax.lax.stop_gradient(plan))

@@ -1,4 +1,4 @@
-"""What methods share that compare episodes under target copies of the actor's trunk."""
+"""Rewarders that compare episodes under target copies of encoder and actor's trunk."""
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +14,14 @@ from jaxil.rewarders.comparison import Compare, make_comparing_rewarder
 
 
 class TargetState(struct.PyTreeNode):
-    """What such a method remembers between episodes.
+    """What such a rewarder remembers between episodes.
 
     Attributes:
       target_encoder: copy of the live encoder.
       target_actor: copy of the live actor, of which the trunk is used.
       expert_features: demonstrations under the copies. Shape [K, N + 1, D].
-      scale: factor on rewards, set by the first episode; 0 before. Shape [].
+      scale: factor on rewards, set by the first episode; 0 before; always 1 where
+        rewards are not scaled. Shape [].
       steps_since_copy: agent steps in episodes since the last copy. Shape [].
     """
 
@@ -41,9 +42,9 @@ def make_target_rewarder(
 ) -> Rewarder:
     """Returns a rewarder of whole episodes under slowly changing features.
 
-    The copies are taken at the end of the first episode that finds at least
-    `target_update_steps` agent steps gone by since the last time, and at the first
-    episode of all, when the live networks are still as initialised.
+    The copies are taken at the end of a run's first episode, when the live networks are
+    still as initialised, and then at the end of each episode that completes at least
+    `target_update_steps` agent steps since the last copy.
 
     Args:
       agent: its encoder, actor's trunk and frame stack are used.
@@ -85,7 +86,7 @@ def make_target_rewarder(
             steps_since_copy=jnp.zeros((), jnp.int32),
         )
 
-    def look(
+    def update_features(
         state: TargetState,
         learner: LearnerParams,
         episode: Episode,
@@ -102,7 +103,7 @@ def make_target_rewarder(
 
     return make_comparing_rewarder(
         init=init,
-        look=look,
+        update_features=update_features,
         embed=lambda state, frames: embed(
             state.target_encoder, state.target_actor, frames
         ),

@@ -31,7 +31,7 @@ METHOD = methods.Method(
                 0,
                 10**6,
             ),
-            # What is blocked costs 1000, which a larger epsilon would forgive.
+            # A blocked pair costs 1000; with a larger epsilon that would not block it.
             "epsilon": methods.Field(
                 0.01, "weight of the entropy, in units of cost; 0.01", 1e-6, 1.0
             ),
@@ -58,31 +58,29 @@ def make_rewarder(
 ) -> Rewarder:
     """Returns the rewarder of TemporalOT.
 
-        r_t = - scale * sum_n C_tn P_tn,    C = context cost, P = plan within the band
+        r_t = - scale * sum_n C_{t+1,n} P_{t+1,n}
 
-    It is P-SIL with another cost and another plan, see `context_cost` and `band_plan`;
-    for the other arguments see `make_target_rewarder`.
+    It is P-SIL with another cost C, `context_cost`, and another plan P, `band_plan`.
+    For the other arguments see `make_target_rewarder`.
 
     Source: Fu et al. 2024, Robot Policy Learning with Temporal Optimal Transport
     Reward, on the features of P-SIL; the paper's are those of a frozen ResNet.
     """
 
     def match(agent: Array, experts: Array, num_moments: Array) -> tuple[Array, Array]:
-        def one(expert: Array, own: Array) -> tuple[Array, Array]:
-            cost = context_cost(
-                transport.cosine_cost(agent, expert), own, context_length=context_length
+        def match_one(expert: Array, length: Array) -> tuple[Array, Array]:
+            cost = transport.cosine_cost(agent, expert)
+            cost = context_cost(cost, length, context_length=context_length)
+            plan = band_plan(
+                cost,
+                transport.uniform_mass(length, len(expert)),
+                band_steps=band_steps,
+                epsilon=epsilon,
+                num_iterations=num_iterations,
             )
-            mass = transport.uniform_mass(own, len(expert))
-            return cost, plan_within_band(cost, mass)
+            return cost, plan
 
-        return jax.vmap(one)(experts, num_moments)
-
-    plan_within_band = functools.partial(
-        band_plan,
-        band_steps=band_steps,
-        epsilon=epsilon,
-        num_iterations=num_iterations,
-    )
+        return jax.vmap(match_one)(experts, num_moments)
 
     def rewards(agent: Array, experts: Array, num_moments: Array) -> Array:
         return closest_rewards(*match(agent, experts, num_moments))
@@ -108,11 +106,11 @@ def context_cost(cost: Array, num_moments: Array, *, context_length: int) -> Arr
 
     Args:
       cost: c, of pairs of single moments. Shape [T, N].
-      num_moments: how many of the N are the expert's own. Shape [].
+      num_moments: how many of the expert's N are not padding. Shape [].
       context_length: pairs in a mean; 1 returns the costs themselves.
 
     Returns:
-      Costs; 0 for moments that are not the expert's own. Shape [T, N].
+      Costs; 0 for padding. Shape [T, N].
 
     Source: Fu et al. 2024, the context-aware cost; fuyw/TemporalOT.
     """
@@ -142,8 +140,8 @@ def band_plan(
 
         P_tn = 0  where  |t - n| > band_steps
 
-    A moment of the longer episode that has no partner within the band is matched
-    outside it.
+    Where episodes differ in length, moments of the longer one without a partner in the
+    band are matched outside it.
 
     Args:
       cost: pairwise costs, of the size of cosine costs. Shape [T, N].

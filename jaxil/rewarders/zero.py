@@ -19,7 +19,7 @@ METHOD = methods.Method(
 
 
 def make_rewarder(agent: AgentSpec) -> Rewarder:
-    """Returns a reward of zero everywhere."""
+    """Returns a rewarder of zeros."""
     del agent
     return Rewarder(zero_rewards)
 

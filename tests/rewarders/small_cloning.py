@@ -11,13 +11,10 @@ from jaxil.learner.update import init_train_state
 from jaxil.maths.types import Batch, ExpertBatch
 from jaxil.rewarders import pdac, pdac_cloning, psil, psil_cloning
 from jaxil.rewarders.pseudo_actions import with_cloning
-from tests.rewarders.small_world import learner_with
-from tests.tiny_agent import (
-    make_tiny_networks,
-    random_actions,
-)
+from tests.rewarders.small_world import SIDE, STATE_DIM, learner_with
+from tests.tiny_agent import make_tiny_networks, random_actions
 
-STATE_DIM, SIDE, BATCH = 3, 8, 16
+BATCH = 16
 OF_PDAC: dict[str, Any] = {
     "hidden_dim": 16,
     "learning_rate": 3e-3,

@@ -1,4 +1,4 @@
-"""A world for methods that clone inferred actions, and learners small enough for it."""
+"""A world for methods that clone actions, and learners small enough for it."""
 
 import jax
 import numpy as np
@@ -6,6 +6,7 @@ import optax
 
 from jaxil.learner.rewarder import AgentSpec, Spec
 from jaxil.learner.update import Learner, init_train_state
+from jaxil.maths import augmentation
 from jaxil.maths.types import Batch, ExpertBatch
 from tests.tiny_agent import make_tiny_networks
 
@@ -20,11 +21,11 @@ def learner_of(make_rewarder, observation, shift_padding, settings):
     return learner_with(networks, make_rewarder(agent, **settings), shift_padding)
 
 
-def learner_with(networks, rewarder, shift_padding):
+def learner_with(networks, rewarder, shift_padding, learning_rate=3e-3):
     return Learner(
         networks=networks,
         rewarder=rewarder,
-        learning_rate=3e-3,
+        learning_rate=learning_rate,
         critic_target_tau=0.01,
         noise_clip=0.3,
         shift_padding=shift_padding,
@@ -65,3 +66,24 @@ def demonstrations(rng, size=32):
     successor = moved(observation, expert_actions(observation))
     untold = np.full((size, 2), np.nan, np.float32)
     return ExpertBatch(observation, untold, successor)
+
+
+def pictures(seed=0):
+    """Pixels of play and demonstrations in which nothing moves."""
+    rng = np.random.default_rng(seed)
+    pixels = rng.integers(0, 256, (32, SIDE, SIDE, 3), dtype=np.uint8)
+    action, unread = np.zeros((32, 2), np.float32), np.full(32, np.nan, np.float32)
+    batch = Batch(pixels, action, unread, unread, pixels, pixels)
+    return batch, ExpertBatch(pixels, action, pixels)
+
+
+def record_shifts(monkeypatch):
+    """Returns a list to which `augmentation.augment` adds all that it returns."""
+    returned, real = [], augmentation.augment
+
+    def augment(observation, key, *, padding):
+        returned.append(real(observation, key, padding=padding))
+        return returned[-1]
+
+    monkeypatch.setattr(augmentation, "augment", augment)
+    return returned

@@ -3,16 +3,16 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from scipy import stats
 
 from jaxil.learner.policy import make_mean_action
 from jaxil.learner.rewarder import AgentSpec, Spec
-from jaxil.learner.update import Learner, init_train_state
+from jaxil.learner.update import init_train_state
 from jaxil.maths import losses
 from jaxil.maths.types import ExpertBatch
 from jaxil.rewarders import bc
+from tests.rewarders.small_world import learner_with
 from tests.tiny_agent import make_tiny_networks
 
 SHAPE = (12, 12, 3)
@@ -21,16 +21,8 @@ NETWORKS = make_tiny_networks(feature_dim=8, hidden_dim=32, channels=(8,))
 
 
 def make_learner(shift_padding=0, learning_rate=3e-3):
-    return Learner(
-        networks=NETWORKS,
-        rewarder=bc.make_rewarder(AgentSpec(NETWORKS, 1, shift_padding), **SETTINGS),
-        learning_rate=learning_rate,
-        critic_target_tau=0.01,
-        noise_clip=0.3,
-        shift_padding=shift_padding,
-        pre_tanh_penalty=0.0,
-        exploration_std=optax.constant_schedule(0.1),
-    )
+    rewarder = bc.make_rewarder(AgentSpec(NETWORKS, 1, shift_padding), **SETTINGS)
+    return learner_with(NETWORKS, rewarder, shift_padding, learning_rate)
 
 
 def make_state(learner):

@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 
 from jaxil.learner.policy import make_mean_action
-from jaxil.maths import augmentation
-from jaxil.maths.types import Batch, ExpertBatch
 from jaxil.rewarders import bco
 from tests.rewarders.small_world import (
-    SIDE,
     demonstrations,
     expert_actions,
     learner_of,
+    pictures,
     play,
+    record_shifts,
     state_of,
 )
 from tests.tiny_agent import make_episode, random_frames
@@ -72,24 +71,13 @@ def test_the_inverse_model_learns_from_the_agent_alone():
 
 def test_both_observations_of_a_pair_are_shifted_alike(monkeypatch):
     """If nothing moves, the inverse model must see that nothing moves."""
-    seen = []
-    real = augmentation.augment
-
-    def watched(observation, key, *, padding):
-        seen.append(real(observation, key, padding=padding))
-        return seen[-1]
-
-    monkeypatch.setattr(augmentation, "augment", watched)
-    rng = np.random.default_rng(0)
-    pixels = rng.integers(0, 256, (32, SIDE, SIDE, 3), dtype=np.uint8)
-    action = np.zeros((32, 2), np.float32)
-    unread = np.full(32, np.nan, np.float32)
-    batch = Batch(pixels, action, unread, unread, pixels, pixels)
+    seen = record_shifts(monkeypatch)
+    batch, expert = pictures()
     step = bco.make_update_step(make_learner("pixels", 2), **SETTINGS)
-    step(make_state("pixels", 2), batch, ExpertBatch(pixels, action, pixels))
+    step(make_state("pixels", 2), batch, expert)
     pair = next(x for x in seen if x.shape[-1] == 6)
     np.testing.assert_array_equal(pair[..., :3], pair[..., 3:])
-    assert np.any(pair[..., :3] != pixels)
+    assert np.any(pair[..., :3] != batch.observation)
 
 
 def test_asks_for_successors_and_refuses_another_number_of_samples():

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from jaxil.learner.policy import make_mean_action
-from jaxil.maths import augmentation
-from jaxil.maths.types import Batch, ExpertBatch
+from jaxil.maths.types import ExpertBatch
 from jaxil.networks.agent import apply
 from jaxil.networks.discriminator import Embedding
 from jaxil.rewarders import bcvlr
 from tests.rewarders.small_world import (
-    SIDE,
     demonstrations,
     expert_actions,
     learner_of,
+    pictures,
     play,
+    record_shifts,
     state_of,
 )
 from tests.tiny_agent import make_episode, random_frames
@@ -52,16 +52,6 @@ def make_step(observation="state", shift_padding=0, **changes):
 @functools.cache
 def make_state(observation="state", shift_padding=0, **changes):
     return state_of(make_learner(observation, shift_padding, **changes), observation)
-
-
-def pictures(seed=0):
-    """Play and demonstrations in which nothing moves."""
-    pixels = np.random.default_rng(seed).integers(
-        0, 256, (32, SIDE, SIDE, 3), dtype=np.uint8
-    )
-    action, unread = np.zeros((32, 2), np.float32), np.full(32, np.nan, np.float32)
-    batch = Batch(pixels, action, unread, unread, pixels, pixels)
-    return batch, ExpertBatch(pixels, action, pixels)
 
 
 @functools.cache
@@ -179,14 +169,7 @@ def test_the_target_follows_slowly():
 
 def test_both_observations_of_a_pair_are_shifted_alike(monkeypatch):
     """If nothing moves, the inverse model must see that nothing moves."""
-    seen = []
-    real = augmentation.augment
-
-    def watched(observation, key, *, padding):
-        seen.append(real(observation, key, padding=padding))
-        return seen[-1]
-
-    monkeypatch.setattr(augmentation, "augment", watched)
+    seen = record_shifts(monkeypatch)
     batch, expert = pictures()
     step = bcvlr.make_update_step(make_learner("pixels", 2), **SETTINGS)
     step(make_state("pixels", 2), batch, expert)

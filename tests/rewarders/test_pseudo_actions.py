@@ -11,8 +11,7 @@ import pytest
 from jaxil.learner.policy import make_mean_action
 from jaxil.learner.rewarder import AgentView, Rewarder
 from jaxil.learner.update import make_update_step
-from jaxil.maths import augmentation, cloning
-from jaxil.maths.types import Batch, ExpertBatch
+from jaxil.maths import cloning
 from jaxil.networks.agent import apply
 from jaxil.networks.inverse_model import InverseModels
 from jaxil.rewarders.pseudo_actions import with_cloning
@@ -21,7 +20,6 @@ from tests.rewarders.small_cloning import (
     BATCH,
     KINDS,
     OF_CLONING,
-    STATE_DIM,
     assert_same,
     compiled,
     differ,
@@ -34,9 +32,13 @@ from tests.rewarders.small_cloning import (
     make_state,
     observations,
 )
-from tests.tiny_agent import (
-    random_actions,
+from tests.rewarders.small_world import (
+    demonstrations,
+    expert_actions,
+    play,
+    record_shifts,
 )
+from tests.tiny_agent import random_actions
 
 # The term ----------------------------------------------------------------------
 
@@ -128,29 +130,14 @@ def test_the_term_pulls_the_policy_towards_the_label():
 # Learning ----------------------------------------------------------------------
 
 
-def moved(observation, action):
-    """A world in which an action moves two of three coordinates."""
-    return observation + np.pad(action, ((0, 0), (1, 0))).astype(np.float32)
-
-
-def play(rng):
-    """The agent's transitions cover the expert's; every action earns the same."""
-    observation = rng.uniform(-1, 1, (32, STATE_DIM)).astype(np.float32)
-    action = rng.uniform(-1, 1, (32, 2)).astype(np.float32)
-    successor = moved(observation, action)
-    one, discount = np.ones(32, np.float32), np.full(32, 0.5, np.float32)
-    return Batch(observation, action, one, discount, successor, successor)
-
-
-def expert_actions(observation):
-    """What the expert does: it goes back to the middle."""
-    return -0.8 * observation[:, 1:]
-
-
-def demonstrations(rng):
-    observation = rng.uniform(-1, 1, (32, STATE_DIM)).astype(np.float32)
-    successor = moved(observation, expert_actions(observation))
-    return ExpertBatch(observation, np.full((32, 2), np.nan, np.float32), successor)
+def rewarded_play(rng):
+    """The agent's transitions; every action earns the same."""
+    batch = play(rng)
+    return batch._replace(
+        reward=np.ones(32, np.float32),
+        discount=np.full(32, 0.5, np.float32),
+        next_observation=batch.successor,
+    )
 
 
 @functools.cache
@@ -163,7 +150,7 @@ def learned(weight, trust):
     step = jax.jit(make_update_step(learner))
     metrics = {}
     for _ in range(600):
-        state, metrics = step(state, play(rng), demonstrations(rng))
+        state, metrics = step(state, rewarded_play(rng), demonstrations(rng))
     seen = demonstrations(rng).observation
     copied = make_mean_action(learner.networks)(
         state.encoder.params, state.actor.params, seen
@@ -222,13 +209,7 @@ def test_the_experts_actions_change_nothing(name, trust):
 
 def test_both_observations_of_a_pair_are_shifted_alike(monkeypatch):
     """If nothing moves, the inverse models must see that nothing moves."""
-    seen, real = [], augmentation.augment
-
-    def watched(observation, key, *, padding):
-        seen.append(real(observation, key, padding=padding))
-        return seen[-1]
-
-    monkeypatch.setattr(augmentation, "augment", watched)
+    seen = record_shifts(monkeypatch)
     _, ours = make_methods("psil", "pixels", shift_padding=2)
     pixels, features = observations(0, "pixels", BATCH), jnp.zeros((BATCH, 16))
     state = make_state(make_learner(ours, "pixels", 2), "pixels")

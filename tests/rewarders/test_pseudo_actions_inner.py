@@ -11,7 +11,6 @@ from jaxil.learner.rewarder import Rewarder, Spec
 from jaxil.learner.update import make_update_step
 from jaxil.rewarders.zero import zero_rewards
 from tests.rewarders.small_cloning import (
-    STATE_DIM,
     assert_same,
     compiled,
     given,
@@ -22,10 +21,8 @@ from tests.rewarders.small_cloning import (
     make_state,
     observations,
 )
-from tests.tiny_agent import (
-    make_episode,
-    make_experts,
-)
+from tests.rewarders.small_world import STATE_DIM
+from tests.tiny_agent import make_episode, make_experts
 
 
 @pytest.mark.parametrize(

@@ -85,8 +85,8 @@ def test_rewards_fall_where_the_embedding_has_learned():
 
 
 def test_the_gradient_is_that_of_the_distance():
-    # Of the regularised distance: the entropy counts too, so the two are compared in
-    # direction, where epsilon is small.
+    # It is exact for the distance with its entropy; without, and with a small epsilon,
+    # the direction is the same.
     rng = np.random.default_rng(0)
     agent, expert = jnp.asarray(rng.normal(size=(2, 6, 4)), jnp.float32)
     tight = make_matching(
