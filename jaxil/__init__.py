@@ -4,8 +4,8 @@
     environment = policy.make_environment()  # or jaxil.make_environment(task, seed=0)
     demonstrations = jaxil.load_demonstrations(task="cartpole_swingup")
 
-These are imported where they are first used, so that `import jaxil` takes no time, and
-choose OpenGL's and jax's settings before that, as the commands do.
+Each name is imported on first use, so that `import jaxil` is fast. Before that, OpenGL
+and jax are set up as the commands do it.
 """
 
 import importlib

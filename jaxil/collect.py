@@ -7,7 +7,7 @@ evaluates the mean actions of the runs' policies and records the best. The file 
 simulator states, from which each training renders pixels for its agent; for tasks that
 are not dm_control's, it holds pixels.
 
-    jaxil collect --policy=package.module:function --task=gymnasium:ID \\
+    jaxil collect --policy=package.module:function --task=gymnasium:ID \
         --output=FILE.npz
 
 records a function of the task's own observation, a flat vector, that returns an action
@@ -145,15 +145,15 @@ def _write(
     from jaxil.environments.interaction import Restorable
 
     output, returns = pathlib.Path(values.output), []
-    played = (
-        environment,
-        lambda _: lambda _, seen: act(seen),
-        values.num_episodes,
-        lambda _, task_return: returns.append(task_return),
-    )
+    play: dict[str, Any] = {
+        "environment": environment,
+        "begin": lambda episode: lambda step, observation: act(observation),
+        "num_episodes": values.num_episodes,
+        "finished": lambda episode, task_return: returns.append(task_return),
+    }
     try:
         if isinstance(environment, Restorable):
-            arrays = playing.play(*played)
+            arrays = playing.play(**play)
             metadata = states.new_metadata(
                 task=task,
                 action_repeat=action_repeat,
@@ -170,7 +170,7 @@ def _write(
             recording = Recording(
                 "jaxil pixels",
                 values.num_episodes,
-                playing.play_pixels(*played),
+                playing.play_pixels(**play),
                 task=task,
                 action_repeat=action_repeat,
                 frames_per_second=seconds and 1.0 / seconds,
@@ -268,7 +268,7 @@ def _reported(path: pathlib.Path, flags_given: str) -> Iterator[None]:
 
 
 def _output_faults(values: flags.FlagValues) -> list[str]:
-    """Checks the output before minutes of work are lost."""
+    """Returns faults of --output that would otherwise show only after minutes."""
     if values.output is None:
         return [] if values.inspect else ["--output=NAME.npz is missing"]
     output = pathlib.Path(values.output)

@@ -1,7 +1,7 @@
 """What all commands share: flags in, one message and an exit status out.
 
 Exit status: 0 done; 2 wrong use, with one message that names every fault; 130
-interrupted; 1 else.
+interrupted; 1 otherwise.
 """
 
 import ast
@@ -20,6 +20,7 @@ from jaxil import config as jaxil_config
 from jaxil import methods, outside, presets
 from jaxil.config import Config
 from jaxil.errors import Fault, UsageError, unknown_name
+from jaxil.files.settings import flat
 
 Define = Callable[[flags.FlagValues], None]
 
@@ -158,7 +159,7 @@ def joined(words: Sequence[str], values: flags.FlagValues | None = None) -> list
             has_value = rest and not rest[0].startswith("--")
             word = f"{word}={rest.pop(0)}" if has_value else word
         name, equals, value = word.partition("=")
-        # The shell leaves a "~" alone that follows a "=".
+        # The shell does not expand a "~" that follows a "=".
         parts = [os.path.expanduser(part) for part in value.split(",")]
         whole.append(f"{name}{equals}{','.join(parts)}")
     return whole
@@ -254,13 +255,24 @@ def _config_of_file(value: str) -> Config:
     if not isinstance(config, ml_collections.ConfigDict):
         rule = "has a get_config() that does not return a ConfigDict"
         raise UsageError(Fault("--config", rule, value=value))
+    there = flat(config.to_dict())
+    known = tuple(jaxil_config.fields(there.get("method", "pdac")))
+    lacking = [name for name in known if name not in there]
+    if lacking:
+        rule = f"has a get_config() that leaves out {', '.join(lacking[:3])}"
+        way_out = "start from jaxil.config.default_config(METHOD, TASK)"
+        raise UsageError(Fault("--config", rule, way_out, value))
+    unknown = [name for name in there if name not in known]
+    if unknown:
+        raise UsageError([unknown_name("field", name, known) for name in unknown])
     return config.unlock()
 
 
 def _change_method(config: Config, method: str) -> None:
-    """Gives a config another method, with the sections that it lacks."""
+    """Gives a config another method, and the sections that it needs."""
     wanted = jaxil_config.default_config(method, config.task)
-    for section in methods.get(config.method).sections:
+    before = methods.get(config.method)
+    for section in before.sections:
         if section not in wanted:
             del config[section]
     for section, fields in methods.get(method).sections.items():
@@ -268,7 +280,11 @@ def _change_method(config: Config, method: str) -> None:
         config[section] = {
             name: old.get(name, field.default) for name, field in fields.items()
         }
-    if not methods.get(method).plays:
+    declared = methods.get(method)
+    if not declared.plays:
+        per_update = config.update_every_steps * config.action_repeat
+        config.total_frames = declared.total_updates * per_update
+    elif not before.plays:
         config.total_frames = wanted.total_frames
     config.method = method
 
@@ -282,7 +298,7 @@ def _override(config: Config, field: str, text: str) -> Iterable[Fault]:
     target = config[group] if group else config
     try:
         target[leaf] = _parsed(text, target[leaf])
-    except (ValueError, SyntaxError):
+    except (ValueError, SyntaxError, TypeError):  # the last of "{{}}"
         expected = _KINDS[type(target[leaf])]
         return [Fault(field, f"has the wrong type: expected {expected}", value=text)]
     return []

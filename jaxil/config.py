@@ -71,8 +71,8 @@ FIELDS: dict[str, Field] = {
     "batch_size": Field(256, "256 in the paper", 1, 65_536),
     "num_steps": Field(3, "of n-step returns; 3 in the paper, 1 on walkers", 1, 100),
     "discount_factor": Field(0.99, "gamma; 0.99 in the paper", 0.0, 1.0),
-    # The paper's table has 2000 and 4000 for these two; DrQ-v2 and ROT, whose table it
-    # is, have 4000 frames before the first update and 2000 steps of uniform actions.
+    # The paper's table gives 2000 and 4000 for these two; DrQ-v2 and ROT, its source,
+    # have 4000 frames before the first update and 2000 steps of uniform actions.
     "seed_frames": Field(4_000, "before the first update; 4000 in DrQ-v2", 1, 10**9),
     "exploration_steps": Field(2_000, "of uniform actions; 2000 in DrQ-v2", 0, 10**9),
     "update_every_steps": Field(2, "agent steps per update; 2 in the paper", 1, 10**6),
@@ -145,8 +145,8 @@ FIELDS: dict[str, Field] = {
         "", "beside the tables and TensorBoard: wandb, or package.module:function"
     ),
 }
-# Fields that change nothing that is learned: runs that differ in no other are seeds of
-# one thing, and may be resumed.
+# Fields that do not affect what is learned: they may differ between the seeds of one
+# experiment, and change when a run is resumed.
 FREE_FIELDS = (
     "total_frames",
     "encoder.convolutions",
@@ -157,7 +157,7 @@ FREE_FIELDS = (
     "video_every_evals",
     "logger",
 )
-# Fields that must end with an agent step.
+# Durations that must be whole agent steps.
 _WHOLE_STEPS = (
     "total_frames",
     "seed_frames",
@@ -270,16 +270,15 @@ def _problems(
                 f"use {nearest}",
                 value,
             )
-    longest = config.max_episode_frames / config.action_repeat
-    if not {"max_episode_frames", "action_repeat", "replay_size_steps"} & bad and (
-        longest > config.replay_size_steps
-    ):
-        yield Fault(
-            "max_episode_frames",
-            "does not fit the replay, which must hold whole episodes",
-            f"use replay_size_steps={math.ceil(longest)} or more",
-            config.max_episode_frames,
-        )
+    if not {"max_episode_frames", "action_repeat", "replay_size_steps"} & bad:
+        longest = math.ceil(config.max_episode_frames / config.action_repeat)
+        if longest > config.replay_size_steps:
+            yield Fault(
+                "max_episode_frames",
+                "does not fit the replay, which must hold whole episodes",
+                f"use replay_size_steps={longest} or more",
+                config.max_episode_frames,
+            )
     for start, end in _FALLING:
         first, last = read(config, start), read(config, end)
         if not {start, end} & bad and last > first:
@@ -309,7 +308,7 @@ def _field_problems(name: str, field: Field, value: Any) -> Iterator[Fault]:
         if value not in field.choices:
             yield unknown_name(name, value, field.choices)
     elif field.low is not None and field.high is not None:
-        inside = math.isfinite(value) and field.low <= value <= field.high
+        inside = field.low <= value <= field.high  # False for NaN
         if not inside or (field.positive and value == field.low):
             bracket = "(" if field.positive else "["
             interval = f"{bracket}{field.low}, {field.high}]"

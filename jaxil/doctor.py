@@ -10,6 +10,7 @@ Exit status: 0 no faults; 1 a fault; 2 invalid arguments.
 
 import contextlib
 import ctypes.util
+import functools
 import importlib.metadata
 import os
 import pathlib
@@ -47,7 +48,7 @@ class Finding(NamedTuple):
 
 
 def examine(config: Any) -> Iterator[Finding]:
-    """Runs all checks for a run of `config`; if None, those that do not need it."""
+    """Runs all checks for a run of `config`; if None, those that need no config."""
     checks = [versions, gl_libraries, jax_devices, convolutions]
     checks += [rendering, memory, demonstrations] if config else []
     for check in checks:
@@ -212,7 +213,7 @@ def _render(task: str, image_size: int, quality: str) -> tuple[str, float]:
 
 
 def _judged(what: str, value: str, advice: str, level: str = "warning") -> Finding:
-    """Returns a finding of the given level if there is advice, else "ok"."""
+    """Returns a finding of level `level` if there is advice, else "ok"."""
     return Finding(level if advice else "ok", what, value, advice)
 
 
@@ -221,13 +222,11 @@ def _read_config(argv: list[str]) -> Any:
     from jaxil import command
     from jaxil import config as jaxil_config
 
-    has_config = any(word.lstrip("-").startswith(("config", "h")) for word in argv[1:])
-    define = command.define_config if has_config else lambda values: None
-    values = command.parse(argv, __doc__ or "", define)
+    define = functools.partial(command.define_config, default="pdac:cartpole_swingup")
+    config = command.parse(argv, __doc__ or "", define).config
     startup.prepare()
     from jaxil.environments import suite
 
-    config = values.config if has_config else jaxil_config.default_config()
     faults = jaxil_config.problems(config, suite.known_tasks())
     if faults:
         raise UsageError(faults)

@@ -1,4 +1,4 @@
-"""Errors of the user, as data: field, value, rule, way out."""
+"""User errors as data: field, value, rule, way out."""
 
 import dataclasses
 import difflib
@@ -6,21 +6,21 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 _SHORT_LIST = 20
-_MAX_VALUE, _MAX_FAULT = 200, 4000  # letters that are shown
+_MAX_VALUE, _MAX_FAULT = 200, 4000  # characters shown
 _ABSENT = object()
 
 
-def printable(text: object, max_letters: int = 1000) -> str:
+def printable(text: object, max_length: int = 1000) -> str:
     """Returns text on one line, without control characters and of bounded length.
 
-    Whatever comes from a file goes through it before it is shown: a terminal obeys
-    control characters.
+    Text from files goes through it before it is shown, because terminals obey control
+    characters.
     """
-    letters = str(text)[: max_letters + 1]
+    start = str(text)[: max_length + 1]
     shown = "".join(
-        c if c.isprintable() else " " if c.isspace() else "?" for c in letters
+        c if c.isprintable() else " " if c.isspace() else "?" for c in start
     )
-    return shown if len(shown) <= max_letters else f"{shown[: max_letters - 3]}..."
+    return shown if len(shown) <= max_length else f"{shown[: max_length - 3]}..."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Fault:
 
     Attributes:
       subject: the config field, flag or file.
-      rule: what is wrong with it, as the rest of a sentence that starts with it.
+      rule: what is wrong with it, completing a sentence that starts with `subject`.
       way_out: what to do instead; empty if the rule says it.
       value: what was given.
     """
@@ -56,7 +56,7 @@ class Fault:
 
 
 class UsageError(Exception):
-    """The user asked for something that is not possible, for the reasons `faults`."""
+    """The user asked for something impossible; `faults` says why."""
 
     def __init__(self, faults: "str | Fault | Iterable[str | Fault]") -> None:
         if isinstance(faults, str | Fault):

@@ -11,8 +11,9 @@ import sys
 from absl import flags
 
 from jaxil import command
+from jaxil.errors import UsageError
 
-_FIRST_EPISODE = 1_000_000  # none that training evaluates on
+_FIRST_EPISODE = 1_000_000  # training evaluates on none of these starts
 _GIF_FPS = 12.5
 
 
@@ -70,18 +71,23 @@ def main(argv: list[str]) -> None:
     )
     frames, captions = zip(*sides)
     stem = folder / "videos" / f"evaluation_{run.act.frame:09d}"
-    stem.parent.mkdir(exist_ok=True)
     fps = run_log.frames_per_second(len(frames[0]))
-    video.write_video(stem.with_suffix(".mp4"), *frames, fps=fps, labels=captions)
-    print(f"video: {stem.with_suffix('.mp4')}")
-    if values.gif:
-        stride = round(fps / _GIF_FPS)
-        fewer = [each[::stride] for each in frames]
-        texts = [each[::stride] for each in captions]
-        video.write_gif(
-            stem.with_suffix(".gif"), *fewer, fps=fps / stride, labels=texts
-        )
-        print(f"gif: {stem.with_suffix('.gif')}")
+    film_file, gif = stem.with_suffix(".mp4"), stem.with_suffix(".gif")
+    try:
+        stem.parent.mkdir(exist_ok=True)
+        video.write_video(film_file, *frames, fps=fps, labels=captions)
+        print(f"video: {film_file}")
+        if values.gif:
+            stride = round(fps / _GIF_FPS)
+            fewer = [each[::stride] for each in frames]
+            texts = [each[::stride] for each in captions]
+            video.write_gif(gif, *fewer, fps=fps / stride, labels=texts)
+            print(f"gif: {gif}")
+    except OSError as error:
+        raise UsageError(
+            f"{stem.parent} cannot be written ({error.strerror or error}); make room or"
+            " make it writable, or evaluate a copy of the run"
+        ) from error
 
 
 def _define(values: flags.FlagValues) -> None:

@@ -51,7 +51,7 @@ def main(argv: list[str]) -> None:
     settings = {
         **{name: policy.config[name] for name in _SETTINGS},
         "observation_shape": policy.observation_shape,
-        "observation_dtype": str(policy.observation_dtype.__name__),
+        "observation_dtype": policy.observation_dtype.__name__,
         "frame": policy.frame,
     }
     try:

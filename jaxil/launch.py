@@ -41,7 +41,7 @@ def main(argv: list[str]) -> int:
     faults += assembly.problems(config)
     if faults:
         raise UsageError(faults)
-    devices.device_name()  # a wrong JAX_PLATFORMS is said before jax is needed
+    devices.device_name()  # refuses a wrong JAX_PLATFORMS before anything is written
     for finding in doctor.memory(config):
         screen.say(str(finding))
     gl_name = assembly.renderer_name(config)

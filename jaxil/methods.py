@@ -1,16 +1,17 @@
 """Imitation methods as declarations that can be read without importing jax.
 
-A method is one file: its rewarder, and beside it `METHOD = methods.Method(...)`. The
-files of `jaxil/rewarders`, and those that installed packages name under the entry
-points `jaxil.methods`, are known by their method's name; any other by
+A method is one file: its rewarder, and beside it `METHOD = methods.Method(...)`.
+Configs name those of `jaxil/rewarders`, and those of installed packages with an entry
+point in the group `jaxil.methods`, by the method's name; any other by
 `--config.method=package.module:METHOD`.
 
-A declaration is evaluated on its own, so that the report, sweeps and `--help` start
-without jax: it may use this module, under the name `methods`, and literals. Where it
-needs more, its file is imported.
+A declaration is evaluated without the rest of its file, so that the report, sweeps and
+`--help` start without jax: it may use literals and this module, under the name
+`methods`. If it uses anything else, its file is imported.
 """
 
 import ast
+import contextlib
 import functools
 import importlib
 import importlib.metadata
@@ -65,11 +66,11 @@ class Method(NamedTuple):
     """What the program knows of a method.
 
     Attributes:
-      name: how configs name it; `reference` for methods from outside.
+      name: how configs name it; `get` sets package.module:METHOD if it is not `known`.
       label: how figures and tables name it.
       about: what it learns from, in a few words.
       colour: of its curves, "#rrggbb".
-      rank: where it stands in tables and legends: small numbers first.
+      rank: its place in tables and legends: small numbers first.
       sections: its config sections. Their fields are keyword arguments of
         `make_rewarder`, or of `make_update_step` where there is one.
       make_rewarder: name of a function of its file: (AgentSpec, **fields) -> Rewarder.
@@ -126,8 +127,8 @@ CLONING = {
     "batch_size": Field(128, "expert samples; 128 in ROT", 1, 65_536),
     "std": Field(0.1, "of the policy whose likelihood is raised; 0.1", 1e-6, 10.0),
 }
-# Beside the sections of another method, so no name is one of theirs: all are keyword
-# arguments of one function.
+# Beside these stand another method's sections. All fields are keyword arguments of one
+# function, so no name may occur twice.
 PSEUDO_ACTIONS = {
     "num_pairs": Field(128, "expert transitions that are cloned", 1, 65_536),
     "weight": Field(
@@ -184,7 +185,7 @@ PSIL_SINKHORN = {**SINKHORN, **TARGETS, "num_components": COMPONENTS}
 def known() -> dict[str, Method]:
     """Returns the methods that configs may name, by name, in the order of tables.
 
-    An installed one that cannot be loaded is left out, and named on stderr once.
+    Installed ones that cannot be loaded are left out, each named once on stderr.
     """
     found = {}
     for name, reference in _references().items():
@@ -196,7 +197,7 @@ def known() -> dict[str, Method]:
 
 
 def get(name: str) -> Method:
-    """Returns a method, for which a module from outside may be imported.
+    """Returns a method; imports its module if its declaration needs that.
 
     Args:
       name: a key of `known()`, or "package.module:METHOD". If it comes from a file and
@@ -263,14 +264,11 @@ def _declaration(reference: str) -> Method:
         )
     method: Any = None
     try:
-        try:
-            expression = _assignment(pathlib.Path(spec.origin), name or "METHOD")
-            if expression is not None:
-                here = sys.modules[__name__]
-                code = compile(ast.Expression(expression), spec.origin, "eval")
-                method = eval(code, {"methods": here})
-        except NameError:  # it uses names of its own file
-            pass
+        expression = _assignment(pathlib.Path(spec.origin), name or "METHOD")
+        if expression is not None:
+            code = compile(ast.Expression(expression), spec.origin, "eval")
+            with contextlib.suppress(NameError):  # it uses names of its own file
+                method = eval(code, {"methods": sys.modules[__name__]})
         if method is None:
             method = getattr(importlib.import_module(module), name or "METHOD", None)
     except (Exception, SystemExit) as error:  # whatever is wrong with the file

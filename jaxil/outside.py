@@ -14,7 +14,7 @@ _trusted: set[str] = set()
 
 
 def load(reference: str, subject: str) -> Any:
-    """Imports a module and returns what it calls by that name.
+    """Imports a module and returns the attribute that the reference names.
 
     Args:
       reference: "package.module:name", from the user.

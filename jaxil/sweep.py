@@ -31,7 +31,7 @@ from jaxil.training import workdir
 
 Statuses = dict[Run, Status]
 
-# What Slurm has in its queue, and what someone does already, needs no other job.
+# What Slurm has in its queue, and what another process trains, needs no new job.
 _AWAY = (State.FINISHED, State.QUEUED, State.RUNNING)
 
 
@@ -87,8 +87,8 @@ def main(argv: list[str]) -> int:
 
 
 def _stay(cluster: clusters.Cluster, statuses: Statuses, folder: str) -> int:
-    """Has the runs done here, telling what happens to them."""
-    # Runs that another sweep has may be left unfinished by it.
+    """Does the runs on this machine and prints what happens to them."""
+    # Those of another sweep too, which may leave them unfinished.
     todo = [run for run, s in statuses.items() if s.state is not State.FINISHED]
     known = {run: status.state for run, status in statuses.items()}
 
@@ -130,7 +130,7 @@ def _checked_runs(
         faults += error.faults
         folder = pathlib.Path()
     pairs = [
-        word.lstrip("-").removeprefix("config.").split("=", 1) for word in overrides
+        word.lstrip("-").removeprefix("config.").partition("=") for word in overrides
     ]
     request = plan.Request(
         methods=values.methods,
@@ -139,9 +139,9 @@ def _checked_runs(
         num_seeds=values.seeds,
         preset=values.preset,
         folder=folder,
-        overrides={field: "".join(text) for field, *text in pairs},
+        overrides={field: value for field, _, value in pairs},
     )
-    # What jax needs is not for the runs: they may be on another machine.
+    # `prepare` sets variables for this process; runs may be on another machine.
     environment = dict(os.environ)
     startup.prepare()
     runs = []

@@ -30,7 +30,7 @@ class TrainingDiverged(RuntimeError):
 
 @dataclasses.dataclass(eq=False)
 class Run(Parts):
-    """One training run: its parts, its state, and what happens to them in order."""
+    """One training run: its parts, its state, and the loop over them."""
 
     def __post_init__(self) -> None:
         self.stop_asked = False
@@ -55,7 +55,7 @@ class Run(Parts):
 
         Args:
           whole_episodes: whether episodes that are open when the budget ends are played
-            to their end, so that they count and the last evaluation takes place.
+            to their end, so that they are stored and the last evaluation takes place.
 
         Raises:
           EnvironmentsFailed: there are several, and they cannot go on.
@@ -67,7 +67,8 @@ class Run(Parts):
         if counters.owes_evaluation:
             self.evaluate()
             self.save()
-        # Collected updates run before a stop: fewer at once would act differently.
+        # Collected updates run before a stop: to run fewer of them at once would change
+        # what the agent does next.
         while not self.stop_asked or self.updates.is_pending:
             if player is not None:
                 player.begin(self.wants_episode)
@@ -112,10 +113,10 @@ class Run(Parts):
             rng = self._rng(_UNIFORM_ACTIONS, int(steps[index]))
             actions[index] = rng.uniform(-1.0, 1.0, shape)
         if not uniform.all():
-            # Of one size, though fewer may play at the end: it is compiled once.
+            # Padded to one size, to compile once: fewer may play at the end.
             padded = np.zeros((size, *observations.shape[1:]), observations.dtype)
             padded[:count] = observations
-            # The state is donated at each update: its parameters are read afresh.
+            # Each update donates the state, so its parameters are read anew.
             encoder, actor = self.state.newest_policy
             key = self.exploration_key
             sampled = self.agent.sample_action(encoder, actor, padded, key, steps)
@@ -159,8 +160,8 @@ class Run(Parts):
           later: those that ended in the same round and are stored after it. In the
             table they stand as if played one after the other, in equal times.
         """
-        # Updates may not see an episode that entered after they were due, and rewards
-        # are to come from all that was learned; their own clock starts after it.
+        # Updates may not see an episode that is stored after they were due, and rewards
+        # come from all that was learned. Their own clock starts once that is done.
         self.stopwatch.timed("update", self.flush)()
         self.stopwatch.timed("update", jax.block_until_ready)(self.state.num_updates)
         start = time.perf_counter()
@@ -298,7 +299,7 @@ class Run(Parts):
             self.player.close()
 
     def ask_to_stop(self, who: str) -> bool:
-        """Makes the loop end after this step; False if it was asked before."""
+        """Makes the loop end after this step; returns False if already asked to."""
         if self.stop_asked:
             return False
         self.stop_asked = True
@@ -307,7 +308,7 @@ class Run(Parts):
         return True
 
     def newest_checkpoint(self) -> str:
-        """Returns a few words on it, for messages."""
+        """Describes the newest checkpoint in a few words, for messages."""
         frame = self.checkpoints.newest()
         return "there is none" if frame is None else f"that of frame {frame}"
 

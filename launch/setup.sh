@@ -63,7 +63,7 @@ is_ready() { # EXTRAS; each includes the project's own dependencies
   stamp=$(digest) && grep -qs "^$stamp ${1:+$1\$}" "$ready_file"
 }
 
-# Prints what the packages of .venv depend on: folder, Python, and the two files.
+# Prints a digest of what .venv's packages depend on: folder, Python and two files.
 digest() {
   local version
   version=$("$venv/bin/python" -c 'import sys; print(sys.version)' 2>&1) || return 1

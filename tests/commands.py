@@ -12,7 +12,7 @@ from unittest import mock
 from jaxil import command
 
 ROOT = pathlib.Path(__file__).parent.parent
-# Ten frames per decision make an episode of 100 decisions.
+# Ten frames per agent step make an episode of 100 steps.
 SMALL = (
     "--config.action_repeat=10",
     "--config.image_size=24",
@@ -59,7 +59,7 @@ _OWN = {
 
 
 def call(module: str, *flags: str) -> subprocess.CompletedProcess:
-    """Does what `run` does, in this process: saves the seconds of a start."""
+    """Does what `run` does, but in this process, which saves the seconds of a start."""
     main = importlib.import_module(f"jaxil.{module}").main
     words = [f"jaxil.{module}", *flags]
     out, err = io.StringIO(), io.StringIO()

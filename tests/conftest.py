@@ -14,8 +14,8 @@ if _worker and hasattr(os, "sched_setaffinity"):
     _cores = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {_cores[int(_worker.removeprefix("gw")) % len(_cores)]})
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# Tracing takes most of the time: a fifth of it goes into notes of where each operation
-# was written, and into searching for garbage among what is still used.
+# Tracing takes most of the time, and a fifth of it goes into recording where in the
+# source each operation is and into garbage collections that find nothing.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 gc.set_threshold(50_000, 20, 20)
 startup.prepare()

@@ -34,7 +34,7 @@ def wait_for(condition: Callable[[], object], seconds: float = 100.0) -> None:
 
 
 def is_alive(pid: int) -> bool:
-    """Returns whether a process runs; a dead one may wait for its parent to look."""
+    """Returns whether a process exists and is no zombie."""
     try:
         status = pathlib.Path(f"/proc/{pid}/stat").read_text().rsplit(")")[-1]
     except (FileNotFoundError, ProcessLookupError):

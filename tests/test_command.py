@@ -63,6 +63,48 @@ def test_lists(text, value):
     assert config.encoder.channels == value
 
 
+@pytest.mark.parametrize("text", ["32", "(32,", "{{}}"])
+def test_what_is_no_list_is_one_sentence(text):
+    (fault,) = _faults(PDAC, f"--config.encoder.channels={text}")
+    assert f"{text!r} has the wrong type: expected a list in brackets" in fault
+
+
+@pytest.mark.parametrize(
+    ("lines", "lacking"),
+    [
+        ("return ml_collections.ConfigDict({'seed': 3})", "method, task, observation"),
+        (
+            "config = default_config('pdac', 'walker_walk')\n"
+            "    config.method = 'psil'\n"
+            "    return config",
+            "sinkhorn.cost, sinkhorn.alignment, sinkhorn.epsilon",
+        ),
+    ],
+)
+def test_a_file_whose_config_lacks_fields_is_one_sentence(lines, lacking, tmp_path):
+    (tmp_path / "own.py").write_text(
+        "import ml_collections\n"
+        "from jaxil.config import default_config\n"
+        f"def get_config():\n    {lines}\n"
+    )
+    (fault,) = _faults(f"--config={tmp_path}/own.py")
+    assert f"leaves out {lacking}; start from" in fault
+
+
+def test_fields_that_a_file_misspells_are_named(tmp_path):
+    (tmp_path / "own.py").write_text(
+        "from jaxil.config import default_config\n"
+        "def get_config():\n"
+        "    config = default_config('pdac', 'walker_walk')\n"
+        "    config.bath_size = 8\n"
+        "    config.discriminator.hiden_dim = 8\n"
+        "    return config\n"
+    )
+    first, second = _faults(f"--config={tmp_path}/own.py")
+    assert "'bath_size' is unknown; did you mean: batch_size" in first
+    assert "'discriminator.hiden_dim' is unknown" in second
+
+
 def test_switches():
     assert _parse(PDAC, "--nostart").start is False
     assert _parse(PDAC, "--start=false").start is False
@@ -136,13 +178,10 @@ def test_help_lists_every_field_with_default_and_range(capsys):
 
 @pytest.mark.parametrize("file", sorted((ROOT / "configs").glob("*.py")), ids=str)
 def test_each_file_of_configs_is_a_preset_of_the_package(file):
-    # "walker" in a name is the task that the file fixes.
-    name, _, _ = file.stem.partition("_walker")
-    argument = {"tiny": ":psil,cheetah_run"}.get(name, ":cheetah_run")
-    preset = f"{name}{argument}" if name == file.stem else f"{name}:walker_walk"
-    written = f"{file}{argument}" if name == file.stem else f"{file}"
+    argument = "psil,cheetah_run" if file.stem == "tiny" else "cheetah_run"
     of_file, of_preset = (
-        command.read_config([f"--config={value}"]) for value in (written, preset)
+        command.read_config([f"--config={name}:{argument}"])
+        for name in (file, file.stem)
     )
     assert of_file.to_dict() == of_preset.to_dict()
 

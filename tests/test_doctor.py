@@ -311,6 +311,12 @@ def test_the_config_of_the_command_line_is_examined(monkeypatch, tmp_path):
         "walker_run",
         64,
     )
+    assert doctor.main(["doctor", "--config.image_size=96"]) == 0
+    assert (seen[1].method, seen[1].task, seen[1].image_size) == (
+        "pdac",
+        "cartpole_swingup",
+        96,
+    )
     with pytest.raises(UsageError, match="image_size=3"):
         doctor.main([*argv[:2], "--config.image_size=3"])
     with pytest.raises(UsageError, match="image_sice"):

@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 import types
 
 import jax
@@ -18,6 +17,7 @@ from jaxil.files.tables import read_csv
 from jaxil.training import expert_distance, learner_files, learning_curve, parts
 from tests.commands import ROOT, arguments, call, small_run
 from tests.demonstrations.videos import open_video
+from tests.processes import wait_for
 
 _CLOCKS = ("seconds", "frames_per_second", "reward_seconds")
 # Three episodes; rewards are refreshed at frames 2000 and 3000. The components that the
@@ -119,9 +119,10 @@ def test_outlives_its_pipe_and_resumes_bit_for_bit_after_a_kill(unbroken, tmp_pa
     process.stdout.readline()
     process.stdout.close()
     # Killed with an episode begun after the first checkpoint.
-    _wait_for(lambda: list(tmp_path.glob("checkpoints/frame_000000002000*")), process)
+    saved = "checkpoints/frame_000000002000*"
+    wait_for(lambda: list(tmp_path.glob(saved)) or process.poll() is not None, 900.0)
     process.kill()
-    process.wait()
+    assert process.wait() < 0, "the run ended too soon"
     assert not (tmp_path / "checkpoints" / "frame_000000003000").exists()
 
     resumed = call("launch", *small_run("pdac", tmp_path), *_REFRESHED)
@@ -246,11 +247,3 @@ def _start(*flags: str) -> subprocess.Popen:
         text=True,
         env={**os.environ, "JAX_PLATFORMS": "cpu"},
     )
-
-
-def _wait_for(condition, process, seconds: float = 900.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert process.poll() is None, "the run ended too soon"
-        assert time.monotonic() < end, "the run is too slow"
-        time.sleep(0.02)

@@ -8,8 +8,8 @@ import pathlib
 
 import pytest
 
+from jaxil import command, methods
 from jaxil import config as jaxil_config
-from jaxil import methods
 from jaxil.errors import UsageError
 from jaxil.presets import tiny
 from tests.commands import ROOT, SMALL, call, small_run
@@ -101,9 +101,16 @@ def test_a_method_that_does_not_play_updates_as_often_in_every_preset(task):
     for config in (
         jaxil_config.default_config("bc", task),
         tiny.get_config(f"bc,{task}"),
+        command.read_config([f"--config=tiny:pdac,{task}", "--config.method=bc"]),
     ):
         frames_of_an_update = config.update_every_steps * config.action_repeat
         assert config.total_frames == 55_000 * frames_of_an_update  # of the reference
+
+
+@pytest.mark.parametrize("task", ["walker_walk", "ball_in_cup_catch"])
+def test_a_method_that_plays_trains_as_long_in_place_of_one_that_does_not(task):
+    changed = command.read_config([f"--config=bc:{task}", "--config.method=pdac"])
+    assert changed.to_dict() == jaxil_config.default_config("pdac", task).to_dict()
 
 
 def test_labels_ranks_and_colours_are_unique():

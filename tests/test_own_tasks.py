@@ -10,6 +10,7 @@ import pytest
 from jaxil import collect, outside
 from jaxil.config import default_config
 from jaxil.demonstrations import foreign, states
+from jaxil.environments import tasks
 from jaxil.errors import UsageError
 from jaxil.training import expert_distance, workdir
 from tests.commands import ROOT, call, run, small
@@ -194,7 +195,7 @@ def record(task, policy, path):
     )
 
 
-def test_faults_of_tasks_are_one_message_each(tmp_path):
+def test_faults_of_tasks_are_one_message_each():
     for task, words in (
         ("gymnasium:Hoper-v5", "Hopper"),
         ("gymnasium:CartPole-v1", "Discrete"),
@@ -206,7 +207,6 @@ def test_faults_of_tasks_are_one_message_each(tmp_path):
         assert len(found) == 1
         assert words in found[0], found
     assert "dm_control" in _problems("light:make", camera="side")[0]
-    del tmp_path
 
 
 @pytest.mark.parametrize("task", ["harm:make", "gymnasium:harm:Harm-v0"])
@@ -227,8 +227,6 @@ def test_a_folder_or_file_alone_makes_python_import_nothing(task, tmp_path):
 
 
 def _problems(task, **changes):
-    from jaxil.environments import tasks
-
     settings = {
         "image_size": 24,
         "observation": "pixels",
@@ -240,8 +238,6 @@ def _problems(task, **changes):
 
 
 def test_pixels_are_scaled_and_starts_depend_on_seed_and_number_alone():
-    from jaxil.environments import tasks
-
     environment = tasks.make_environment("light:make", seed=3, image_size=16)
     starts = [environment.reset(episode=episode).observation for episode in (5, 6, 5)]
     assert starts[0].shape == (16, 16, 9)
@@ -250,8 +246,6 @@ def test_pixels_are_scaled_and_starts_depend_on_seed_and_number_alone():
 
 
 def test_a_task_of_composer_is_seeded_rendered_and_cut_off():
-    from jaxil.environments import tasks
-
     assert _problems("light:hinge", camera="side") == []
     assert "0 side" in _problems("light:hinge", camera="front")[0]
     assert "suite" in _problems("light:hinge", distraction="easy")[0]
@@ -272,8 +266,6 @@ def test_a_task_of_composer_is_seeded_rendered_and_cut_off():
 
 
 def test_environments_of_one_process_render_what_they_would_alone():
-    from jaxil.environments import tasks
-
     def make(size):
         task = "gymnasium:InvertedPendulum-v5"
         environment = tasks.make_environment(task, seed=0, image_size=size)
@@ -302,8 +294,6 @@ def test_environments_of_one_process_render_what_they_would_alone():
     [("gymnasium:InvertedPendulum-v5", 0.0), ("gymnasium:Reacher-v5", 1.0)],
 )
 def test_a_termination_has_discount_zero_and_a_truncation_one(task, discount):
-    from jaxil.environments import tasks
-
     environment = tasks.make_environment(task, seed=0, observation="state")
     step = environment.reset(episode=0)
     while not step.last():

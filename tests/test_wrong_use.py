@@ -1,12 +1,15 @@
 """Each wrong use ends with status 2 and one message: field, value, rule, way out."""
 
+import types
+
 import numpy as np
 import pytest
 
 from jaxil import command
 from jaxil import config as jaxil_config
 from jaxil.demonstrations import states
-from jaxil.training import assembly, workdir
+from jaxil.environments import evaluation
+from jaxil.training import assembly, film, trained, workdir
 from tests.commands import call, small_run
 
 _TASKS = ("walker_walk", "cartpole_swingup")
@@ -21,6 +24,8 @@ _BAD_VALUES = (
     ("batch_size", -3, ("batch_size=-3",)),
     ("learning_rate", 0.0, ("learning_rate=0.0", "(0, 1]")),
     ("learning_rate", float("nan"), ("nan",)),
+    ("action_repeat", 0, ("action_repeat=0 must lie in [1, 100]",)),
+    ("seed", 10**400, ("must lie in [0, 2147483647]",)),  # more than a float can hold
     ("discount_factor", 1.5, ("discount_factor=1.5", "0.99")),
     ("critic_target_tau", 2.0, ("critic_target_tau=2.0",)),
     ("sinkhorn.epsilon", float("inf"), ("sinkhorn.epsilon=inf",)),
@@ -32,6 +37,7 @@ _BAD_VALUES = (
     ("learning_rate_end", 2e-4, ("is above learning_rate=0.0001", "must not grow")),
     ("discriminator.batch_size", 512, ("at most 256",)),
     ("replay_size_steps", 10, ("replay_size_steps=10",)),
+    ("max_episode_frames", 400_000, ("use replay_size_steps=200000 or more",)),
     ("demonstrations.num_episodes", 0, ("demonstrations.num_episodes=0",)),
     ("updates_per_dispatch", 0, ("must lie in [1, 1000]",)),
     ("num_environments", 65, ("must lie in [1, 64]",)),
@@ -152,8 +158,21 @@ def test_a_folder_without_a_run_is_said(name, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_values_that_are_not_finite_are_numbers_to_numpy():
-    # The door uses math.isfinite, which takes NumPy's floats too.
-    config = jaxil_config.default_config("pdac", "walker_walk")
-    config.discount_factor = float(np.float32("nan"))
-    assert len(jaxil_config.problems(config, _TASKS)) == 1
+def test_a_video_that_cannot_be_written_costs_no_returns(tmp_path, monkeypatch):
+    run = types.SimpleNamespace(
+        config=jaxil_config.default_config("zero"),
+        environment=None,
+        act=types.SimpleNamespace(frame=2000),
+    )
+    played = evaluation.Evaluation([], np.array([3.0]), [])
+    monkeypatch.setattr(trained, "load", lambda folder: run)
+    monkeypatch.setattr(assembly, "renderer_name", lambda config: "a renderer")
+    monkeypatch.setattr(evaluation, "evaluate", lambda *_, **__: played)
+    monkeypatch.setattr(film, "recorder", lambda *_: None)
+    sides = [(np.zeros((2, 16, 16, 3), np.uint8), ["", ""])]
+    monkeypatch.setattr(film, "sides", lambda *_, **__: sides)
+    (tmp_path / "videos").touch()  # where its folder belongs
+    finished = call("evaluate", f"--workdir={tmp_path}")
+    assert finished.returncode == 2
+    assert "mean 3.0" in finished.stdout
+    assert f"{tmp_path}/videos cannot be written (File exists)" in finished.stderr

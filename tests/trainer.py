@@ -1,4 +1,4 @@
-"""Stands in for `jaxil.launch` where only its manners matter, and starts in no time.
+"""Stands in for `jaxil.launch` where only its files and signals matter; starts fast.
 
 It keeps a run's folder as the real one does: lock, tables, checkpoints, resuming from
 the newest checkpoint, and saving at the first request to stop.

@@ -1,7 +1,7 @@
 """Presets by name: `--config=NAME[:ARGUMENT]`.
 
-`METHOD:TASK` are the paper's settings of any known method; the modules of this folder
-are the others. The files of the repository's `configs/` are the same code.
+`METHOD:TASK` gives the paper's settings for any known method; each module of this
+folder is one more preset. The repository's `configs/` hold the same presets as files.
 """
 
 import importlib

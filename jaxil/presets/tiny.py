@@ -8,38 +8,38 @@ shadows. Other deviations from the paper:
 - The mean image of the demonstrations is subtracted and the contrast raised, since a
   small moving body is only a few pixels at 48x48.
 - The squared pre-tanh mean is penalised, since small actors saturate permanently.
-  Beside P-SIL's small rewards that weight is a hundred times as heavy, and with it
-  `walker_stand` learned to lie still on state vectors, and `finger_spin` nothing in 33k
+  Beside P-SIL's small rewards this weight counts a hundred times as much: with it, on
+  state vectors, `walker_stand` learned to lie still and `finger_spin` nothing in 33k
   frames, so it is smaller there. With neither did P-SIL learn to stand from pixels.
 - The average of the policies of about the last 1000 updates is evaluated and kept
-  (`policy_tau`), since the newest falls back between evaluations. Training never
-  uses the average.
+  (`policy_tau`), since the newest policy is worse at times. Training never uses the
+  average.
 - Exploration ends sooner, the agent updates every step and learning rates are higher,
-  since runs have to be short. It ends soonest on finger_spin, where on state vectors
-  that gave 294 instead of 180 to 230 at 60k frames.
+  since runs have to be short. Exploration ends soonest on finger_spin, where this gave
+  294 instead of 180 to 230 at 60k frames on state vectors.
 - The replay is smaller, so that its rewards are newer, and they are recomputed
   (`reward_refresh_steps`): those of the first episodes come from an untrained
   discriminator and would teach the critic that random behaviour is best.
 - On the walkers and on finger_spin P-DAC's discriminator judges 32 principal components
   of each frame instead of the critic's features, which mislead it: `walker_stand` and
-  `finger_spin` are learned with the first and not with the second. On
-  `ball_in_cup_catch` it is the other way round: a small ball is lost in components
+  `finger_spin` are learned from components and not from features. On
+  `ball_in_cup_catch` it is the other way round: components lose a small ball
   (launch/results/README.md, "Learning: the ladder"). On walker_run, which has not been
-  tried, they are assumed. P-SIL compares them on finger_spin and walker_walk; on
+  tried, components are assumed. P-SIL compares them on finger_spin and walker_walk; on
   `walker_stand` they mislead it too.
 - cartpole_swingup is seen by the camera that follows the cart. DrQ-v2's shows the pole
-  one pixel wide, and not at the rail's ends: agents needed more frames, and then
-  dropped the pole again and again. Pixels of another renderer may need
+  one pixel wide, and not at all at the rail's ends: agents needed more frames, and then
+  kept dropping the pole. Demonstrations in pixels of another renderer may need
   `--config.camera=0`.
 - cartpole_swingup repeats actions 4 times: with 2, a pole at 1 rad/s moves a quarter of
   a pixel between frames, which hides its speed, and agents only learned to spin it;
   with 8, none learned to balance it. P-DAC's gradient penalty has weight 1 there.
-  With batches of 32 an update takes half the time, but one of two seeds learned
-  nothing in 260k frames.
-- Learning rates fall on cartpole_swingup, finger_spin and walker_walk: agents that walk
-  fall over again and again at the first rate (457 of 961 at 500k frames), and less at
-  the last. P-SIL's falls half as fast on cartpole_swingup: with that, and the smaller
-  penalty, a seed has 843 of 856 at 280k frames that had 373 at 300k without.
+  Batches of 32 halved the time of an update, but one of two seeds learned nothing in
+  260k frames.
+- Learning rates fall on cartpole_swingup, finger_spin and walker_walk: agents that have
+  learned to walk keep falling over at the first rate (457 of 961 at 500k frames), and
+  less at the last. P-SIL's rate falls half as fast on cartpole_swingup: with that and
+  the smaller penalty one seed had 843 of 856 at 280k frames, without them 373 at 300k.
 """
 
 from jaxil import config as jaxil_config
@@ -57,7 +57,7 @@ _FALLING_RATES = {
 }
 _FALLING_RATES_OF_PSIL = _FALLING_RATES | {"cartpole_swingup": (300_000, 150_000)}
 _WALKERS = ("walker_stand", "walker_walk", "walker_run")
-_LIGHTER_OF_PSIL = (*_WALKERS, "finger_spin", "cartpole_swingup")
+_SMALL_PENALTY_OF_PSIL = (*_WALKERS, "finger_spin", "cartpole_swingup")
 _JUDGED_BY_COMPONENTS = {
     "pdac": (*_WALKERS, "finger_spin"),
     "psil": ("walker_walk", "finger_spin"),
@@ -113,35 +113,36 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     declared = methods.get(method)
     if not declared.plays:  # as many updates as with the paper's settings
         config.total_frames = declared.total_updates * config.action_repeat
-    lighter = rewarder == "psil" and task in _LIGHTER_OF_PSIL
-    config.pre_tanh_penalty = 2e-5 if lighter else 2e-3
+    is_small = rewarder == "psil" and task in _SMALL_PENALTY_OF_PSIL
+    config.pre_tanh_penalty = 2e-5 if is_small else 2e-3
     config.policy_tau = 1e-3
     config.replay_size_steps = 50_000
     config.replay_on_device = True  # also on CPUs, where XLA stacks faster than NumPy
     config.exploration_std_steps = 20_000 if task == "finger_spin" else 50_000
-    own = config.get("discriminator", {})
-    if "hidden_dim" in own:
-        own.hidden_dim = 256
-        own.gradient_penalty = _GRADIENT_PENALTIES.get((rewarder, task), 10.0)
-    if "width" in own:
-        own.width = 8
-    if own:
-        own.batch_size = _DISCRIMINATOR_BATCHES.get(method, 64)
-        own.learning_rate = 3e-4
-    transport = config.get("sinkhorn", {})
+    discriminator = config.get("discriminator", {})
+    if "hidden_dim" in discriminator:
+        discriminator.hidden_dim = 256
+        penalty = _GRADIENT_PENALTIES.get((rewarder, task), 10.0)
+        discriminator.gradient_penalty = penalty
+    if "width" in discriminator:
+        discriminator.width = 8
+    if discriminator:
+        discriminator.batch_size = _DISCRIMINATOR_BATCHES.get(method, 64)
+        discriminator.learning_rate = 3e-4
+    sinkhorn = config.get("sinkhorn", {})
     if task in _JUDGED_BY_COMPONENTS.get(rewarder, ()):
-        (transport or own).num_components = 32
-    if transport:
-        transport.num_iterations = 50
-    if "target_update_steps" in transport:
-        transport.target_update_steps = 5_000 if config.action_repeat == 2 else 2_500
+        (sinkhorn or discriminator).num_components = 32
+    if sinkhorn:
+        sinkhorn.num_iterations = 50
+    if "target_update_steps" in sinkhorn:
+        sinkhorn.target_update_steps = 5_000 if config.action_repeat == 2 else 2_500
     config.reward_refresh_steps = 2_500
     config.eval_every_frames = 20_000
     config.checkpoint_every_frames = 10_000
     for section, sizes in _SMALL.items():
         if section in config:
-            has = config[section]
-            has.update({name: sizes[name] for name in sizes if name in has})
+            settings = config[section]
+            settings.update({n: size for n, size in sizes.items() if n in settings})
     if config.action_repeat > 2:  # fewer agent steps in as many frames
         config.exploration_steps = 500
         config.exploration_std_steps = 20_000

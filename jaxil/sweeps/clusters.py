@@ -29,11 +29,11 @@ _JAX_MEMORY = 0.9  # of a GPU that several runs share
 # Slurm's default MaxArraySize allows no larger index.
 _ARRAY_SIZE = 1000
 _REQUEUES = 1000  # on timeouts: a run is worth resuming until it is done
-# How long before the time limit a run is asked to save: a checkpoint takes seconds,
-# a decision that waits for a compilation a minute.
+# How long before the time limit a run is asked to save: a checkpoint takes seconds, but
+# an agent step that waits for a compilation takes a minute.
 _SAVING_SECONDS = 120
 _ANSWER_SECONDS = 60
-_PATIENCE_SECONDS = 300.0  # file locks of a node that broke down last a while
+_PATIENCE_SECONDS = 300.0  # file locks of a crashed node last a while
 # After SIGTERM, Slurm either kills the job or lets submitit requeue it.
 _VERDICT_SECONDS = 600.0
 
@@ -87,7 +87,7 @@ def problems(cluster: Cluster, *, starts: bool) -> Iterator[Fault]:
 
 
 def num_at_once(cluster: Cluster, num_runs: int) -> int:
-    """Returns how many runs go on at a time, at most."""
+    """Returns how many runs go on at a time at most."""
     return num_runs if cluster.name == "slurm" else len(places(cluster, num_runs))
 
 
@@ -118,7 +118,7 @@ def start(
     folder: pathlib.Path,
     watch: Callable[[], None],
 ) -> None:
-    """Has the runs done; on Slurm, only submits them.
+    """Does the runs; on Slurm, only submits them.
 
     Args:
       cluster: checked.
@@ -138,11 +138,11 @@ def start(
     shares = places(cluster, len(runs))
     workers = [Worker(runs, place, here) for place in shares]
     for worker in workers:
-        # Daemons, so that another Ctrl-C ends the sweep; its runs then still save.
+        # Daemons, so that a second Ctrl-C ends the sweep; its runs still save then.
         threading.Thread(target=worker.work, daemon=True).start()
 
     def wait(watch: Callable[[], None]) -> None:
-        # Not Thread.join, which an exception makes believe that the thread has ended.
+        # Not Thread.join: an exception during it marks the thread as ended.
         while not all(worker.has_ended for worker in workers):
             watch()
             time.sleep(_POLL_SECONDS)
@@ -159,12 +159,12 @@ def start(
 class Job(Worker):
     """One Slurm job: a pickled instance is what submitit calls on the node."""
 
-    # Slurm may send its signals to the run as well, or only to this process: it
-    # depends on the cluster. By then the run has met its own, and ignores SIGHUP.
+    # On some clusters Slurm signals the run too, on others only this process. After the
+    # pause, a run that got its own signal is saving already and ignores SIGHUP.
     pause_seconds = 3.0
 
     def __call__(self) -> None:
-        """Does its run; requeues it when Slurm warns of an end."""
+        """Does its run; requeues it when Slurm warns that it will end the job."""
         from submitit.core.job_environment import JobEnvironment
 
         requeue_signal = JobEnvironment._usr_sig()
@@ -198,7 +198,7 @@ def submit(cluster: Cluster, runs: Sequence[Run], logs: pathlib.Path) -> None:
 
     Args:
       cluster: checked.
-      runs: at least one; their commands are seen from the current folder.
+      runs: at least one; their commands are run in the current folder.
       logs: folder of what submitit writes; all nodes must see it.
     """
     import submitit
@@ -209,7 +209,7 @@ def submit(cluster: Cluster, runs: Sequence[Run], logs: pathlib.Path) -> None:
         job_name="jaxil",
         time=minutes,
         cpus_per_task=cluster.num_cpus,
-        # srun no longer takes it over from sbatch.
+        # srun no longer inherits it from sbatch.
         srun_args=[f"--cpus-per-task={cluster.num_cpus}"],
         signal_delay_s=min(_SAVING_SECONDS, 15 * minutes),
         setup=[f"export PYTHONPATH={shlex.quote(python_path())}"],

@@ -50,7 +50,7 @@ def make_runs(
     Raises:
       UsageError: names every fault of every run, each once.
     """
-    # Without any method, one stands in, so that faults of tasks are found as well.
+    # If no method is valid, one stands in, so that faults of tasks are found as well.
     choices = _choices(request) or [_Choice(figures.Variant("drqv2"), False)]
     groups = {f"{t}/{c.variant.slug}": (t, c) for t in request.tasks for c in choices}
     found = [(fault, "") for fault in _request_problems(request, choices)]
@@ -180,7 +180,7 @@ def _preset(preset: str, method: str, task: str) -> list[str]:
 
 
 def _seeds(request: Request, config: Config, words: list[str]) -> Iterator[Run]:
-    # The settings decide on the name: --config.shift_padding=0 makes another variant.
+    # The settings name the variant: --config.shift_padding=0 makes another one.
     slug = figures.variant_of(config.to_dict()).slug
     for seed in range(request.num_seeds):
         folder = request.folder / config.task / slug / f"seed{seed}"
@@ -201,7 +201,7 @@ def _folder_problems(sweep: pathlib.Path, run: Run, config: Config) -> Iterator[
         return
     config.seed = run.seed
     for fault in workdir.problems(run.folder, config):
-        # With one name for all folders, the same fault of many runs is one fault.
+        # Under one name for all folders, a fault that many runs share is listed once.
         yield dataclasses.replace(fault, value=f"{sweep}/TASK/VARIANT/seedN")
 
 

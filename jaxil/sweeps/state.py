@@ -1,4 +1,4 @@
-"""How far a run has come, told from its folder alone.
+"""How far a run has come, judged by its folder alone.
 
 Nothing else remembers a sweep, so it can be killed anywhere, watched from elsewhere and
 started again. Beside what `jaxil.launch` writes, a run's folder holds
@@ -30,7 +30,7 @@ _COLUMNS = ("frame", "seconds", "task_return_mean")  # read from tables
 
 
 class Run(NamedTuple):
-    """One run, as the worker that trains it has to know it."""
+    """One run of a sweep: what it takes to train it and to find its results."""
 
     task: str
     slug: str  # of the variant
@@ -63,7 +63,7 @@ class Status(NamedTuple):
 
     state: State
     frame: int = 0  # the last one in its tables
-    seconds: float = 0.0  # until then, evaluations included
+    seconds: float = 0.0  # up to that frame, evaluations included
     last_return: float | None = None  # None before the first evaluation
 
     @property
@@ -112,8 +112,8 @@ def is_finished(run: Run) -> bool:
 
 def is_in_use(run: Run) -> bool:
     """Returns whether a worker has the run, or someone who started it by hand."""
-    # In this order: to look at a lock holds it for a moment, and the process that a
-    # worker starts must not meet that.
+    # In this order: looking at a lock holds it for a moment, and a process that a
+    # worker has just started must not find its own lock held.
     return any(locking.is_locked(run.folder / name) for name in ("claim", "lock"))
 
 

@@ -31,7 +31,7 @@ _GUESSES = {
     ("paper", "GPU"): 220.0,
     ("tiny", "GPU"): 220.0,
 }
-_ENOUGH_SECONDS = 60.0  # before that, a run has mostly compiled
+_ENOUGH_SECONDS = 60.0  # a younger run has mostly compiled
 _ENDS = (State.FINISHED, State.FAILED, State.DAMAGED)
 
 
@@ -46,14 +46,14 @@ def print_plan(statuses: Statuses) -> None:
     _console().print(table)
     for run, status in statuses.items():
         if status.state is State.DAMAGED:
-            table_rule = "its table cannot be read and is set aside when it resumes"
-            print(f"{run.name} is damaged: {state.damage(run) or table_rule}")
+            of_table = "its table cannot be read and is set aside when it resumes"
+            print(f"{run.name} is damaged: {state.damage(run) or of_table}")
 
 
 def estimate(
     todo: Statuses, statuses: Statuses, *, num_at_once: int, preset: str, on_gpu: bool
 ) -> str:
-    """Returns a sentence on what is left.
+    """Returns a sentence on what is left to do and how long it takes.
 
     Args:
       todo: the runs to be done.
@@ -73,7 +73,7 @@ def estimate(
         left / statistics.median(measured.get(run.method, [guess]))
         for run, left in frames.items()
     ]
-    # The last runs cannot be shared out: no less than the longest one.
+    # A run cannot be split, so it takes no less than the longest one.
     until_end = max(sum(seconds) / max(num_at_once, 1), *seconds)
     text = (
         f"Left to do: {sum(frames.values()):,} frames, {sum(seconds) / 3600:,.1f} hours"
@@ -122,7 +122,7 @@ def watch(look: Callable[[], Statuses]) -> Statuses:
 
 
 def changes(before: dict[Run, State], statuses: Statuses) -> Iterator[str]:
-    """Yields a line for each run whose state is another one now; updates `before`."""
+    """Yields a line for each run whose state has changed; updates `before`."""
     for run, status in statuses.items():
         if before.get(run) is not status.state:
             before[run] = status.state

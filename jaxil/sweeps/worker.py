@@ -1,4 +1,4 @@
-"""What does the runs of a sweep, one after the other.
+"""The worker, which does runs of a sweep one after the other.
 
 Each run is a process of its own, the ordinary command, so that neither its crash nor
 its leftover memory touches the next one.
@@ -25,10 +25,10 @@ _POLL_SECONDS = 0.2
 _IDLE_SECONDS = 2.0
 _STOPPED_STATUS = 130  # of jaxil.launch, when someone asked it to stop
 _WRONG_USE_STATUS = 2
-# A run is asked to stop by SIGHUP, since that does no harm to one that was asked
-# before: of other signals, the second ends it unsaved. What starts a run makes SIGHUP
-# work also under nohup and has the kernel send it when the worker dies (1 stands for
-# PR_SET_PDEATHSIG). Slurm's warnings, which mean "requeue" to a worker, would kill it.
+# A run is asked to stop by SIGHUP, which is harmless if it was asked before: a second
+# one of the other signals ends it unsaved. The starter makes SIGHUP work under nohup
+# and has the kernel send it when the worker dies (1 is PR_SET_PDEATHSIG). It ignores
+# Slurm's warnings, which tell a worker to requeue but would kill the run.
 _STARTER = """
 import ctypes, os, signal, sys
 ctypes.CDLL(None).prctl(1, signal.SIGHUP)
@@ -43,18 +43,18 @@ class Place(NamedTuple):
     """The share of a machine that a worker's runs get."""
 
     cores: tuple[int, ...] = ()  # empty for all that there are
-    environment: tuple[tuple[str, str], ...] = ()  # variables to be set
+    environment: tuple[tuple[str, str], ...] = ()  # variables to set
 
 
 @dataclasses.dataclass(eq=False)
 class Worker:
     """Takes runs from a list that other workers share, until none is left."""
 
-    runs: Sequence[Run]  # finished and failed ones are passed over
+    runs: Sequence[Run]  # finished and failed ones are skipped
     place: Place
-    folder: pathlib.Path  # that the commands are seen from
-    patience_seconds: float = float("inf")  # with runs that others have and may leave
-    must_stop: bool = False  # set it to have the current run saved and the worker end
+    folder: pathlib.Path  # where the commands are run
+    patience_seconds: float = float("inf")  # of waiting for runs that others have
+    must_stop: bool = False  # set it to save the current run and end the worker
     has_ended: bool = False
     pause_seconds: ClassVar[float] = 0.0  # before a run is asked to stop
 
@@ -81,7 +81,7 @@ class Worker:
                 time.sleep(_IDLE_SECONDS)
 
     def _do(self, run: Run) -> bool:
-        """Trains a run; returns False if another has it, which may leave it."""
+        """Trains a run; returns False if another process has it and may abandon it."""
         if state.is_finished(run) or state.damage(run):
             return True
         try:
@@ -126,7 +126,7 @@ class Worker:
         return True
 
     def _wait(self, process: subprocess.Popen) -> int:
-        """Waits for a run's process; asks it to save and end when it is time to."""
+        """Waits for a run's process, and asks it to stop once `must_stop` is set."""
         asked = False
         while True:
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -138,7 +138,7 @@ class Worker:
 
 
 def python_path() -> str:
-    """Returns a PYTHONPATH in which processes find this project, wherever they are."""
+    """Returns a PYTHONPATH with which processes in any folder find this project."""
     before = os.environ.get("PYTHONPATH", "")
     # An installed package is found anyway; its folder must not come before Python's.
     own = "" if pathlib.Path(sysconfig.get_path("purelib")) == _ROOT else str(_ROOT)

@@ -98,7 +98,7 @@ class Unbroken:
 def killed(
     method: str, count: int, rng: np.random.Generator, folder: pathlib.Path
 ) -> Iterator[str]:
-    """Freezes a training process and copies its files, which a kill would leave.
+    """Freezes a training process and copies the files that a kill would leave.
 
     The last one is killed.
     """
