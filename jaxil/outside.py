@@ -38,7 +38,11 @@ def load(reference: str, subject: str) -> Any:
 
 
 def trust(reference: str) -> None:
-    """Notes that the user has named this code, so files may name it too."""
+    """Notes that the user has named this code, so files may name it too.
+
+    Args:
+      reference: "package.module:name" of a method or task, as a run's config has it.
+    """
     _trusted.add(reference)
 
 
@@ -64,7 +68,7 @@ def require_trusted(reference: str, subject: str, where: object) -> None:
                 subject,
                 f"is code from outside that {where} names and you do not",
                 f"if you trust it, add --trust={printable(reference)} (in Python: "
-                "jaxil.outside.trust)",
+                "jaxil.trust)",
                 printable(reference),
             )
         )

@@ -7,7 +7,8 @@ import textwrap
 import numpy as np
 import pytest
 
-from jaxil import collect, outside
+import jaxil
+from jaxil import collect
 from jaxil.config import default_config
 from jaxil.demonstrations import foreign, states
 from jaxil.environments import tasks
@@ -222,7 +223,7 @@ def test_a_folder_or_file_alone_makes_python_import_nothing(task, tmp_path):
     states.write_states(tmp_path / "states.npz", stored)
     with pytest.raises(UsageError, match=f"--trust={task}"):
         collect.main(["collect", f"--inspect={tmp_path / 'states.npz'}"])
-    outside.trust(task)
+    jaxil.trust(task)
     assert workdir.read_config(tmp_path).task == task
 
 
