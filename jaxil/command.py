@@ -23,6 +23,7 @@ from jaxil.errors import Fault, UsageError, unknown_name
 from jaxil.files.settings import flat
 
 Define = Callable[[flags.FlagValues], None]
+Check = Callable[[flags.FlagValues], Iterable[Fault | str]]
 
 _CONFIG, _TRUST = "config", "trust"
 _KINDS = {
@@ -33,13 +34,16 @@ _KINDS = {
 }
 
 
-def parse(argv: list[str], description: str, define: Define) -> flags.FlagValues:
+def parse(
+    argv: list[str], description: str, define: Define, check: Check = lambda values: ()
+) -> flags.FlagValues:
     """Reads the command line, collecting every fault before it gives up.
 
     Args:
       argv: as in `sys.argv`.
       description: what `--help` says first.
       define: adds the command's flags; see `define_config`.
+      check: returns the faults of their values.
 
     Raises:
       UsageError: names all flags and config fields that are wrong.
@@ -68,6 +72,7 @@ def parse(argv: list[str], description: str, define: Define) -> flags.FlagValues
                 reason = str(error).split(": ", 1)[-1]
                 faults.append(Fault(f"--{name}", f"is wrong: {reason}"))
     values.mark_as_parsed()
+    faults += check(values)
     for reference in values[_TRUST].value or () if _TRUST in values else ():
         if ":" not in reference:
             what = "is not package.module:name"

@@ -19,10 +19,12 @@ _GIF_FPS = 12.5
 
 def main(argv: list[str]) -> None:
     """Runs the command."""
-    values = command.parse(argv, __doc__ or "", _define)
     from jaxil.machine import startup
     from jaxil.training import workdir
 
+    values = command.parse(
+        argv, __doc__ or "", _define, lambda v: workdir.flag_problems(v.workdir)
+    )
     folder = workdir.from_flag(values.workdir)
 
     print(startup.prepare(), file=sys.stderr, flush=True)

@@ -37,10 +37,12 @@ _SETTINGS = ("task", "observation", "action_repeat", "frame_stack", "render_qual
 
 def main(argv: list[str]) -> None:
     """Runs the command."""
-    values = command.parse(argv, __doc__ or "", _define)
     from jaxil.machine import startup
     from jaxil.training import workdir
 
+    values = command.parse(
+        argv, __doc__ or "", _define, lambda v: workdir.flag_problems(v.workdir)
+    )
     folder = workdir.from_flag(values.workdir)
     output = pathlib.Path(values.output)
     startup.prepare()

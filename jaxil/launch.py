@@ -6,26 +6,21 @@ r"""Trains one agent: imitation from video, or DrQ-v2 on the true reward.
 Rerun the same command to resume. `python -m jaxil.launch` is the same command.
 """
 
-import pathlib
-
 from absl import flags
 
 from jaxil import command
-from jaxil.errors import Fault, UsageError
+from jaxil.errors import UsageError
 
 
 def main(argv: list[str]) -> int:
     """Runs the command; returns its exit status."""
-    values = command.parse(argv, __doc__ or "", _define)
     from jaxil.machine import screen, startup
     from jaxil.training import workdir
 
-    faults: list[Fault | str] = []
-    folder = pathlib.Path()
-    try:
-        folder = workdir.from_flag(values.workdir)
-    except UsageError as error:
-        faults += error.faults
+    values = command.parse(
+        argv, __doc__ or "", _define, lambda v: workdir.flag_problems(v.workdir)
+    )
+    folder = workdir.from_flag(values.workdir)
     # Before jax and MuJoCo are imported, which the imports below do.
     screen.say(startup.prepare())
 
@@ -36,9 +31,7 @@ def main(argv: list[str]) -> int:
     from jaxil.training import assembly
 
     config = values.config
-    if not faults:
-        faults += workdir.problems(folder, config)
-    faults += assembly.problems(config)
+    faults = [*workdir.problems(folder, config), *assembly.problems(config)]
     if faults:
         raise UsageError(faults)
     devices.device_name()  # refuses a wrong JAX_PLATFORMS before anything is written

@@ -119,6 +119,23 @@ def test_a_missing_folder_and_a_wrong_task_come_in_one_message():
     assert "walker_walk" in finished.stderr
 
 
+@pytest.mark.parametrize(
+    ("module", "flags", "others"),
+    [
+        ("launch", [], ["--config is missing"]),
+        ("launch", ["--config=pdac:walker_walk", "--config.sed=1"], ["seed"]),
+        ("launch", ["--wrkdir=x", "--config=nowhere.py"], ["--wrkdir", "nowhere.py"]),
+        ("evaluate", ["--num_episodes=no"], ["--num_episodes"]),
+        ("export", ["--output=x", "stray"], ["'stray'"]),
+    ],
+)
+def test_a_missing_folder_and_other_faults_come_in_one_message(module, flags, others):
+    finished = call(module, *flags)
+    assert finished.returncode == 2
+    for text in ("--workdir is missing", *others):
+        assert text in finished.stderr
+
+
 def test_demonstrations_are_checked_before_anything_starts(tmp_path):
     config = jaxil_config.default_config("pdac", "walker_walk")
     cut_off = tmp_path / "cut.npz"

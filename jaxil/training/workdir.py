@@ -5,7 +5,7 @@ import json
 import os
 import pathlib
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from jaxil import config as jaxil_config
@@ -29,6 +29,15 @@ _MAX_CONFIG_BYTES = 10**7
 
 class RunFolderError(Exception):
     """The files of a run cannot be written or read; the message says what to do."""
+
+
+def flag_problems(value: str | None) -> Sequence[Fault | str]:
+    """Returns why `--workdir` names no folder; nothing if it does."""
+    try:
+        from_flag(value)
+    except UsageError as error:
+        return error.faults
+    return ()
 
 
 def from_flag(value: str | None) -> pathlib.Path:
