@@ -65,7 +65,7 @@ def warn_of_pixels(
             "action_repeat."
         )
     longest = int(num_frames.max()) - 1
-    if not repeat and not speed and episode_steps and longest != episode_steps:
+    if not repeat and not speed and longest != episode_steps:
         messages.append(
             f"{path} does not say its action repeat, and its longest episode has "
             f"{longest} steps, but the task's {episode_steps} at "

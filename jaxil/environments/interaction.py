@@ -16,8 +16,8 @@ class Environment(Protocol):
     """
 
     @property
-    def episode_steps(self) -> int | None:
-        """Agent steps of a whole episode; None without a time limit."""
+    def episode_steps(self) -> int:
+        """Agent steps of a whole episode; longer ones are cut off."""
         ...
 
     @property

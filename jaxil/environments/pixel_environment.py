@@ -184,7 +184,7 @@ class PixelEnvironment(dm_env.Environment):
 
     @property
     def episode_steps(self) -> int:
-        """Agent steps of a whole episode."""
+        """Agent steps of a whole episode; longer ones are cut off."""
         return math.ceil(self._frame_limit / self._action_repeat)
 
     @property

@@ -108,8 +108,8 @@ def make_environment(
 
 
 @functools.cache
-def timing(task: str, action_repeat: int) -> tuple[float | None, int | None]:
-    """Returns an agent step's seconds, and an episode's steps; None if unknown."""
+def timing(task: str, action_repeat: int) -> tuple[float | None, int]:
+    """Returns an agent step's seconds, None if unknown, and an episode's steps."""
     settings = {"action_repeat": action_repeat, "image_size": 8}
     environment = make_environment(task, seed=0, **settings)
     found = environment.step_seconds, environment.episode_steps

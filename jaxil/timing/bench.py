@@ -17,7 +17,6 @@ from jaxil.training import agent as agents
 from jaxil.training import assembly
 from jaxil.training.parts import make_parts
 
-_EPISODE_STEPS = 500  # of tasks without a time limit
 _RENDERED_FRAMES = 20  # of the random episode; rendering 500 would take too long
 
 
@@ -173,7 +172,7 @@ class Bench:
 
     def _random_episode(self) -> Episode:
         environment = self._environment
-        num_steps = environment.episode_steps or _EPISODE_STEPS
+        num_steps = environment.episode_steps
         rng = np.random.default_rng(self.config.seed)
         actions = rng.uniform(-1, 1, (num_steps, *environment.action_spec().shape))
         environment.reset(episode=0)

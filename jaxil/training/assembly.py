@@ -243,7 +243,7 @@ def make_replay(config: Config, environment: PixelEnvironment) -> Replay:
     frame = environment.single_observation()
     return Replay(
         capacity_steps=config.replay_size_steps,
-        episode_steps=environment.episode_steps or config.replay_size_steps,
+        episode_steps=environment.episode_steps,
         observation_shape=frame.shape,
         observation_dtype=frame.dtype,
         action_dim=environment.action_spec().shape[0],

@@ -142,7 +142,7 @@ def make_parts(
             timed=functools.partial(TimedPool, stopwatch=stopwatch),
             say=say,
         ),
-        episode_steps=environment.episode_steps or 0,
+        episode_steps=environment.episode_steps,
         replay=replay,
         updates=Updates(config, agent, replay, demonstrations, experts),
         experts=experts,
