@@ -2,12 +2,12 @@
 # Sets up jaxil on this machine, then trains an agent.
 #
 #   bash launch/quickstart.sh
-#       imitates ten episodes of cartpole_swingup from pixels, with small networks that
-#       learn on two CPU cores, into runs/quickstart
+#       learns from the pixels of ten episodes to catch a ball in a cup, with small
+#       networks that learn on two CPU cores, into runs/quickstart
 #   bash launch/quickstart.sh --config.seed=1 --workdir=runs/seed1
 #       the same with other settings
-#   bash launch/quickstart.sh --config=configs/psil.py:walker_walk --workdir=runs/x
-#       runs `python -m jaxil.launch` with these flags
+#   bash launch/quickstart.sh --config=psil:walker_walk --workdir=runs/x
+#       runs `jaxil train` with these flags
 #
 # Rerun the same command to resume. Relative paths start at the project's root. The
 # set-up takes minutes, once: see launch/setup.sh.
@@ -50,6 +50,6 @@ if ! has_flag --config "$@" && ! has_flag --help "$@" && ! has_flag -h "$@"; the
     say "Folder of the run: $root/runs/quickstart (learning_curve.png, videos/, eval.csv)." \
       "Ctrl-C saves and stops; rerun the same command to resume."
   fi
-  set -- --config=configs/tiny.py:pdac,cartpole_swingup "$@"
+  set -- --config=tiny:psil,ball_in_cup_catch "$@"
 fi
 exec "$venv/bin/python" -m jaxil.launch "$@"

@@ -117,7 +117,7 @@ def test_other_pythons_are_refused(project):
     assert "PYTHON=PATH" in printed
 
 
-_CONFIG = "--config=configs/tiny.py:pdac,cartpole_swingup"
+_CONFIG = "--config=tiny:psil,ball_in_cup_catch"
 _DEFAULTS = _CONFIG, "--workdir=runs/quickstart"
 
 
