@@ -29,7 +29,7 @@ shadows. Other deviations from the paper:
   `walker_stand` they mislead it too.
 - On ball_in_cup_catch P-SIL repeats actions 4 times, and its rewards stay as they were
   stored: with rewards recomputed one seed of nine reached 80 % of the expert within 71k
-  to 202k frames, and with stored ones all of four did within 80k to 180k.
+  to 202k frames, and with stored ones all of six did within 80k to 180k.
 - cartpole_swingup is seen by the camera that follows the cart. DrQ-v2's shows the pole
   one pixel wide, and not at all at the rail's ends: agents needed more frames, and then
   kept dropping the pole. Demonstrations in pixels of another renderer may need
