@@ -128,9 +128,7 @@ def _deadline(connection: socket.socket, seconds: float) -> Iterator[threading.E
 
     def end() -> None:
         is_late.set()
-        with contextlib.suppress(
-            OSError
-        ):  # the child closed it, which also ends reading
+        with contextlib.suppress(OSError):  # the child may have closed it
             connection.shutdown(socket.SHUT_RD)
 
     timer = threading.Timer(seconds, end)

@@ -31,10 +31,10 @@ class RunFolderError(Exception):
     """The files of a run cannot be written or read; the message says what to do."""
 
 
-def flag_problems(value: str | None) -> Sequence[Fault | str]:
-    """Returns why `--workdir` names no folder; nothing if it does."""
+def flag_problems(values: Any) -> Sequence[Fault | str]:
+    """Returns why the flag `--workdir` names no folder; nothing if it does."""
     try:
-        from_flag(value)
+        from_flag(values.workdir)
     except UsageError as error:
         return error.faults
     return ()
