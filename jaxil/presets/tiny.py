@@ -141,8 +141,9 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
         (sinkhorn or discriminator).num_components = 32
     if sinkhorn:
         sinkhorn.num_iterations = 50
-    if "target_update_steps" in sinkhorn:
-        sinkhorn.target_update_steps = 5_000 if config.action_repeat == 2 else 2_500
+    for section in (sinkhorn, config.get("coverage", {})):
+        if "target_update_steps" in section:
+            section.target_update_steps = 5_000 if config.action_repeat == 2 else 2_500
     config.reward_refresh_steps = 2_500
     if is_psil and task == "ball_in_cup_catch":
         config.total_frames = 200_000
