@@ -192,10 +192,14 @@ def _field_help(name: str, field: methods.Field) -> str:
     limits = ""
     if field.choices:
         limits = f"; one of {', '.join(field.choices)}"
-    elif field.low is not None:
+    elif field.low is not None and field.high is not None:
         limits = (
             f"; {'above ' if field.positive else ''}{field.low:g} to {field.high:g}"
         )
+    elif field.low is not None:
+        limits = f"; {'above' if field.positive else 'at least'} {field.low:g}"
+    elif field.high is not None:
+        limits = f"; at most {field.high:g}"
     return f"  {name}: {field.about} (default: {field.default!r}{limits})"
 
 
@@ -281,9 +285,15 @@ def _change_method(config: Config, method: str) -> None:
         if section not in wanted:
             del config[section]
     for section, fields in methods.get(method).sections.items():
-        old = config.get(section, {})
+        # Sections of one name are kept as far as the preset changed them.
+        old, declared = config.get(section, {}), before.sections.get(section, {})
+        changed = {
+            name: value
+            for name, value in old.items()
+            if name in declared and value != declared[name].default
+        }
         config[section] = {
-            name: old.get(name, field.default) for name, field in fields.items()
+            name: changed.get(name, field.default) for name, field in fields.items()
         }
     declared = methods.get(method)
     if not declared.plays:

@@ -307,11 +307,12 @@ def _field_problems(name: str, field: Field, value: Any) -> Iterator[Fault]:
     if field.choices:
         if value not in field.choices:
             yield unknown_name(name, value, field.choices)
-    elif field.low is not None and field.high is not None:
-        inside = field.low <= value <= field.high  # False for NaN
-        if not inside or (field.positive and value == field.low):
-            bracket = "(" if field.positive else "["
-            interval = f"{bracket}{field.low}, {field.high}]"
+    elif field.low is not None or field.high is not None:
+        low = -math.inf if field.low is None else field.low
+        high = math.inf if field.high is None else field.high
+        inside = low <= value <= high  # False for NaN
+        if not inside or (field.positive and value == low):
+            interval = f"{'(' if field.positive else '['}{low}, {high}]"
             yield Fault(name, f"must lie in {interval}", field.about, value)
 
 

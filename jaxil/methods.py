@@ -224,9 +224,17 @@ def is_trusted(name: str) -> bool:
 
 
 def load(name: str, function: str) -> Any:
-    """Imports a method's file and returns one of its functions."""
-    module = _references().get(name, name).partition(":")[0]
-    return getattr(importlib.import_module(module), function)
+    """Imports a method's file and returns one of its functions.
+
+    Raises:
+      UsageError: the file has no such function.
+    """
+    path = _references().get(name, name).partition(":")[0]
+    module = importlib.import_module(path)
+    if not hasattr(module, function):
+        rule = f"is declared without its function: {path!r} has no `{function}`"
+        raise UsageError(Fault("method", rule, value=name))
+    return getattr(module, function)
 
 
 @functools.cache

@@ -55,6 +55,20 @@ def test_the_sections_follow_the_method():
     assert config.to_dict() == usual.to_dict()
 
 
+def test_a_section_of_the_same_name_takes_the_new_methods_defaults():
+    """What the preset changed stays; the former method's own defaults do not."""
+    changed = command.read_config([PDAC, "--config.method=laifo"])
+    usual = jaxil_config.default_config("laifo", "walker_walk")
+    assert changed.to_dict() == usual.to_dict()
+    assert changed.discriminator.learning_rate != (
+        jaxil_config.default_config("pdac").discriminator.learning_rate
+    )
+    small = command.read_config(
+        ["--config=tiny:pdac,walker_walk", "--config.method=laifo"]
+    )
+    assert small.discriminator.hidden_dim == 256
+
+
 @pytest.mark.parametrize(
     ("text", "value"), [("(32,16)", (32, 16)), ("[8]", (8,)), ("()", ())]
 )

@@ -26,8 +26,8 @@ shadows. Other deviations from the paper:
   `finger_spin` are learned from components and not from features. On
   `ball_in_cup_catch` it is the other way round: components lose a small ball
   (launch/results/README.md, "Learning: the ladder"). On walker_run, where only 12k
-  frames were tried, components are assumed. P-SIL compares them on finger_spin and walker_walk; on
-  `walker_stand` they mislead it too.
+  frames were tried, components are assumed. P-SIL compares them on finger_spin and
+  walker_walk; on `walker_stand` they mislead it too.
 - On ball_in_cup_catch P-DAC updates four times after each step. Its three seeds reached
   80 % of the expert at 20k, 30k and 50k frames; with one update three of five did, at
   40k to 80k, in about the same time.
@@ -130,19 +130,18 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     config.replay_on_device = True  # also on CPUs, where XLA stacks faster than NumPy
     config.exploration_std_steps = 20_000 if task == "finger_spin" else 50_000
     discriminator = config.get("discriminator", {})
-    if "hidden_dim" in discriminator:
-        discriminator.hidden_dim = 256
-        penalty = _GRADIENT_PENALTIES.get((rewarder, task), 10.0)
-        discriminator.gradient_penalty = penalty
-    if "width" in discriminator:
-        discriminator.width = 8
-    if discriminator:
-        discriminator.batch_size = _DISCRIMINATOR_BATCHES.get(method, 64)
-        discriminator.learning_rate = 3e-4
+    small = {
+        "batch_size": _DISCRIMINATOR_BATCHES.get(method, 64),
+        "gradient_penalty": _GRADIENT_PENALTIES.get((rewarder, task), 10.0),
+        "hidden_dim": 256,
+        "learning_rate": 3e-4,
+        "width": 8,
+    }
+    discriminator.update({n: v for n, v in small.items() if n in discriminator})
     sinkhorn = config.get("sinkhorn", {})
     if task in _JUDGED_BY_COMPONENTS.get(rewarder, ()):
         (sinkhorn or discriminator).num_components = 32
-    if sinkhorn:
+    if "num_iterations" in sinkhorn:
         sinkhorn.num_iterations = 50
     for section in (sinkhorn, config.get("coverage", {})):
         if "target_update_steps" in section:

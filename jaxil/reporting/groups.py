@@ -122,7 +122,7 @@ def differing_fields(runs: Sequence[Run]) -> list[str]:
     return sorted(
         field
         for field in fields
-        if all(_matters(run, field) for run in runs)
+        if all(_has(run, field) and _matters(run, field) for run in runs)
         and len({repr(run.config.get(field)) for run in runs}) > 1
     )
 
@@ -185,6 +185,11 @@ def tasks_of(groups: Iterable[Group]) -> dict[str, list[Group]]:
     for group in groups:
         tasks.setdefault(group.task, []).append(group)
     return tasks
+
+
+def _has(run: Run, field: str) -> bool:
+    # An older run may lack a field that its method has today.
+    return field in run.config or field in jaxil_config.fields(run.variant.method)
 
 
 def _matters(run: Run, field: str) -> bool:

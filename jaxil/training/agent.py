@@ -1,5 +1,6 @@
 """From a checked config to the compiled functions of an agent."""
 
+import inspect
 import math
 from typing import Any, NamedTuple
 
@@ -11,7 +12,9 @@ from jaxil import methods
 from jaxil.config import Config
 from jaxil.demonstrations import loading
 from jaxil.environments.pixel_environment import PixelEnvironment
+from jaxil.errors import Fault, UsageError
 from jaxil.learner.averaging import begin_average, make_averaging_step
+from jaxil.learner.checked import checked_rewarder
 from jaxil.learner.gathering import Step, make_gathering_step, make_repeated_step
 from jaxil.learner.policy import (
     MeanAction,
@@ -162,7 +165,11 @@ def mean_image(
 
 
 def make_rewarder(config: Config, networks: AgentNetworks) -> Rewarder:
-    """Returns the rewarder of the method that the config names."""
+    """Returns the rewarder of the method that the config names.
+
+    Raises:
+      UsageError: the method's function does not take the fields that it declares.
+    """
     method = methods.get(config.method)
     agent = AgentSpec(
         networks=networks,
@@ -170,7 +177,19 @@ def make_rewarder(config: Config, networks: AgentNetworks) -> Rewarder:
         shift_padding=config.shift_padding,
     )
     make = methods.load(config.method, method.make_rewarder)
-    return make(agent, **_own_fields(config))
+    fields, function = _own_fields(config), f"has a `{method.make_rewarder}` that"
+    try:
+        inspect.signature(make).bind(agent, **fields)
+    except TypeError as error:
+        rule = f"{function} does not take its fields: {error}"
+        names = ", ".join(fields) or "none"
+        way_out = f"give it the agent and, as keywords, the declared fields ({names})"
+        raise UsageError(Fault("method", rule, way_out, config.method)) from error
+    rewarder = make(agent, **fields)
+    if not isinstance(rewarder, Rewarder):
+        rule = f"{function} returns {type(rewarder).__name__}"
+        raise UsageError(Fault("method", rule, "return a Rewarder", config.method))
+    return checked_rewarder(config.method, rewarder)
 
 
 def _own_fields(config: Config) -> dict[str, Any]:

@@ -80,7 +80,7 @@ class Outputs:
         """
         self._workdir = workdir
         self._config = config
-        own = methods.get(config.method).metrics
+        own = self._metrics = methods.get(config.method).metrics
         evaluated = resume_frame
         if evaluated is not None and owes_evaluation:
             evaluated -= 1
@@ -119,6 +119,12 @@ class Outputs:
         last_frame, last_seconds = self._last
         speed = (frame - last_frame) / max(seconds - last_seconds, 1e-9)
         self._last = (frame, seconds)
+        unknown = sorted(set(metrics) - {*TRAIN_COLUMNS, *self._metrics})
+        if unknown:
+            raise ValueError(
+                f"{self._config.method} returns metrics that it does not declare: "
+                f"{', '.join(unknown)}; name them in METHOD.metrics"
+            )
         self._write_training(
             frame,
             seconds,

@@ -39,7 +39,7 @@ def make_outputs():
             outputs.close()
 
 
-def write_episode(outputs, frame=1000):
+def write_episode(outputs, frame=1000, metrics=None):
     outputs.episode(
         frame=frame,
         seconds=frame / 100,
@@ -48,8 +48,15 @@ def write_episode(outputs, frame=1000):
         imitation_return=1.0,
         length=500,
         reward_seconds=0.0,
-        metrics={"critic/loss": 0.25, "actor/pre_tanh": 4.0},
+        metrics=metrics or {"critic/loss": 0.25, "actor/pre_tanh": 4.0},
     )
+
+
+def test_a_metric_that_the_method_does_not_declare_is_named(make_outputs, tmp_path):
+    outputs = make_outputs(tmp_path)
+    write_episode(outputs)
+    with pytest.raises(ValueError, match=r"drqv2 .*: mine/loss; .*METHOD"):
+        write_episode(outputs, metrics={"critic/loss": 0.25, "mine/loss": 1.0})
 
 
 _SIDE = film.Side(np.zeros((2, 24, 24, 3), np.uint8), ["", ""])

@@ -1,0 +1,65 @@
+"""What a method returns, checked where it is traced: mistakes of one's own methods."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxil.learner.rewarder import Rewarder
+from jaxil.maths.types import Episode
+
+
+def checked_rewarder(name: str, rewarder: Rewarder) -> Rewarder:
+    """Returns the rewarder, which raises ValueError where it breaks its interface.
+
+    Checked are shapes and types, once for each compilation: rewards are [T], and
+    `observe` and `update` return a state like the one that they got. A state that
+    changed would train, and its checkpoint could not be loaded again.
+
+    Args:
+      name: of the method, for the message.
+      rewarder: see `Rewarder`.
+    """
+
+    def rewards(state: Any, learner: Any, episode: Episode, experts: Any) -> Array:
+        found = rewarder.rewards(state, learner, episode, experts)
+        expected, shape = (episode.actions.shape[0],), getattr(found, "shape", None)
+        if shape != expected:
+            what = type(found).__name__ if shape is None else f"shape {shape}"
+            raise ValueError(
+                f"{name}: `rewards` returned {what} for an episode of {expected[0]} "
+                f"steps; expected one reward for each, shape {expected}"
+            )
+        return jnp.asarray(found)
+
+    def observe(state: Any, *arguments: Any) -> Any:
+        return _like(name, "observe", state, rewarder.observe(state, *arguments))
+
+    def update(state: Any, *arguments: Any) -> Any:
+        found, metrics = rewarder.update(state, *arguments)
+        return _like(name, "update", state, found), metrics
+
+    return rewarder._replace(rewards=rewards, observe=observe, update=update)
+
+
+def _like(name: str, function: str, before: Any, after: Any) -> Any:
+    old, new = _described(before), _described(after)
+    changed = [
+        f"{key or 'the state'} is {new.get(key, 'missing')}, was {old.get(key, 'none')}"
+        for key in dict.fromkeys([*old, *new])
+        if old.get(key) != new.get(key)
+    ]
+    if changed or jax.tree.structure(before) != jax.tree.structure(after):
+        raise ValueError(
+            f"{name}: `{function}` returned a state unlike that of `init`: "
+            f"{'; '.join(changed) or 'its structure differs'}"
+        )
+    return after
+
+
+def _described(state: Any) -> dict[str, str]:
+    return {
+        jax.tree_util.keystr(path): f"{jnp.result_type(leaf)}{list(jnp.shape(leaf))}"
+        for path, leaf in jax.tree_util.tree_leaves_with_path(state)
+    }

@@ -1,0 +1,77 @@
+"""Methods from outside whose declaration and functions do not fit."""
+
+import os
+from typing import Any
+
+import pytest
+
+from jaxil import config as jaxil_config
+from jaxil.errors import UsageError
+from jaxil.training import agent
+from tests.commands import ROOT, run
+
+_METHOD = """
+import jax.numpy as jnp
+
+from jaxil import methods
+from jaxil.learner.rewarder import Rewarder
+
+METHOD = methods.Method(
+    name="flat",
+    label="Flat",
+    about="the same reward always",
+    sections={"flat": {"weight": methods.Field(1.0, "each reward", 1.0)}},
+    uses_demonstrations=False,
+)
+
+
+def make_rewarder(agent, *, weight):
+    return Rewarder(lambda s, l, episode, e: jnp.full(len(episode.actions), weight))
+"""
+
+
+@pytest.fixture
+def write(tmp_path, monkeypatch):
+    """Writes a method into a folder that Python finds; returns its name."""
+    folder = tmp_path / "site"
+    folder.mkdir()
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(folder), str(ROOT))))
+
+    def write(module, old="", new=""):
+        (folder / f"{module}.py").write_text(_METHOD.replace(old, new))
+        information = folder / f"{module}-1.0.dist-info"
+        information.mkdir()
+        (information / "METADATA").write_text(f"Name: {module}\nVersion: 1.0\n")
+        points = f"[jaxil.methods]\nflat = {module}:METHOD\n"
+        (information / "entry_points.txt").write_text(points)
+        return f"{module}:METHOD"
+
+    return write
+
+
+def test_a_range_may_have_one_end(write):
+    write("half_open")
+    helped = run("__main__", "train", "--help")
+    assert helped.returncode == 0, helped.stderr
+    assert "each reward (default: 1.0; at least 1)" in helped.stdout
+    low = run("launch", "--config=flat:walker_walk", "--config.flat.weight=0")
+    assert low.returncode == 2
+    assert "flat.weight=0.0 must lie in [1.0, inf]; each reward" in low.stderr
+
+
+@pytest.mark.parametrize(
+    ("module", "old", "new", "message"),
+    [
+        ("misnamed", "def make_rewarder", "def make_reward", "has no `make_rewarder`"),
+        ("forgetful", "*, weight", "*, wait", "not take its fields: .*'wait'.*weight"),
+        ("silent", "return Rewarder", "Rewarder", "returns NoneType; return a Rewa"),
+    ],
+)
+def test_a_function_that_does_not_fit_its_declaration_is_named(
+    write, module, old, new, message
+):
+    config = jaxil_config.default_config(write(module, old, new), "walker_walk")
+    networks: Any = None  # it never comes to use them
+    with pytest.raises(UsageError, match=message):
+        agent.make_rewarder(config, networks)
