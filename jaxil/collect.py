@@ -103,18 +103,11 @@ def _record_policy(values: flags.FlagValues) -> None:
     if tasks.is_of_suite(values.task or "") and values.task not in known:
         raise UsageError(unknown_name("--task", values.task, known))
     act = outside.load(values.policy, "--policy")
-    settings = {
-        "seed": _SEED,
-        "action_repeat": values.action_repeat,
-        "image_size": values.image_size or _CONVERTED_SIZE,
-    }
+    settings = {"seed": _SEED, "action_repeat": values.action_repeat}
     try:
-        try:
-            environment = tasks.make_environment(
-                values.task, observation="state", **settings
-            )
-        except ValueError:  # it observes images alone
-            environment = tasks.make_environment(values.task, frame_stack=1, **settings)
+        environment = tasks.make_recorded(
+            values.task, image_size=values.image_size, **settings
+        )
         _write(
             values,
             environment,
@@ -144,10 +137,16 @@ def _write(
     from jaxil.demonstrations.readers.recording import Recording
     from jaxil.environments.interaction import Restorable
 
+    def decide(step: int, observation: Any) -> Any:
+        action = np.asarray(act(observation), np.float32)
+        if not np.all(np.abs(action) <= 1.0):  # nor NaN
+            raise ValueError(f"returned {action} at step {step}, not in [-1, 1].")
+        return action
+
     output, returns = pathlib.Path(values.output), []
     play: dict[str, Any] = {
         "environment": environment,
-        "begin": lambda episode: lambda step, observation: act(observation),
+        "begin": lambda episode: decide,
         "num_episodes": values.num_episodes,
         "finished": lambda episode, task_return: returns.append(task_return),
     }

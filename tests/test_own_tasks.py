@@ -2,6 +2,7 @@
 
 import csv
 import os
+import re
 import textwrap
 
 import numpy as np
@@ -57,8 +58,26 @@ class Light(dm_env.Environment):
         return specs.BoundedArray((1,), np.float64, -2.0, 2.0)
 
 
+class Square(Light):
+    def image(self):
+        return np.pad(super().image(), ((5, 5), (0, 0), (0, 0)))
+
+
+class Unrewarded(Light):
+    def step(self, action):
+        return super().step(action)._replace(reward=float("nan"))
+
+
 def make():
     return Light()
+
+
+def far(image):
+    return np.array([5.0])
+
+
+def lost(image):
+    return np.array([np.nan])
 
 
 def centre(image):
@@ -149,6 +168,29 @@ def test_a_function_plays_and_is_recorded(task, policy, tmp_path, capsys):
     assert episode.actions is not None
 
 
+def test_a_square_image_is_recorded_as_the_task_draws_it(tmp_path):
+    """Resized twice it would differ from what the agent sees in the same state."""
+    record("light:Square", "light:centre", tmp_path / "expert.npz", image_size=())
+    recording = foreign.open_recording(tmp_path / "expert.npz", max_bytes=2**24)
+    frames = next(recording.episodes).frames
+    assert frames.shape[1:] == (30, 30, 3)
+    assert set(np.unique(frames)) == {0, 255}  # no grey of a resized edge
+
+
+@pytest.mark.parametrize(
+    ("task", "policy", "message"),
+    [
+        ("light:make", "light:far", "returned [5.] at step 0, not in [-1, 1]"),
+        ("light:make", "light:lost", "returned [nan] at step 0, not in [-1, 1]"),
+        ("light:Unrewarded", "light:centre", "reward is nan after step 0"),
+    ],
+)
+def test_what_no_run_could_read_is_not_recorded(task, policy, message, tmp_path):
+    with pytest.raises(UsageError, match=re.escape(message)):
+        record(task, policy, tmp_path / "expert.npz")
+    assert not (tmp_path / "expert.npz").exists()
+
+
 # tests/test_adoption.py does the same with a task of Gymnasium.
 def test_a_task_from_outside_is_trained_resumed_and_shown(tmp_path):
     expert, workdir = tmp_path / "expert.npz", tmp_path / "runs" / "1"
@@ -183,7 +225,7 @@ def test_a_task_from_outside_is_trained_resumed_and_shown(tmp_path):
     assert "light:make" in (tmp_path / "report" / "index.html").read_text()
 
 
-def record(task, policy, path):
+def record(task, policy, path, image_size=("--image_size=24",)):
     collect.main(
         [
             "collect",
@@ -191,7 +233,7 @@ def record(task, policy, path):
             f"--task={task}",
             f"--output={path}",
             "--num_episodes=2",
-            "--image_size=24",
+            *image_size,
         ]
     )
 

@@ -173,6 +173,16 @@ class PixelEnvironment(dm_env.Environment):
         resized = Image.fromarray(image).resize(size, Image.Resampling.BILINEAR)
         return np.array(resized)
 
+    @property
+    def own_image_size(self) -> int | None:
+        """Side of the square image that the task itself observes; None without one.
+
+        Known after a reset.
+        """
+        shapes = [image.shape[:2] for image in _images_in(self._seen)]
+        is_square = len(shapes) == 1 and shapes[0][0] == shapes[0][1]
+        return shapes[0][0] if is_square else None
+
     def renderer_name(self) -> str:
         """Returns a few words on what renders the images."""
         return "the task's own"

@@ -23,6 +23,7 @@ from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.errors import Fault, UsageError
 
 _GYMNASIUM = "gymnasium:"
+_RECORDED_SIZE, _LARGEST_RECORDED = 84, 160  # larger images would fill the memory
 _DEFAULTS = {
     "action_repeat": 2,
     "frame_stack": 3,
@@ -105,6 +106,40 @@ def make_environment(
                 Fault(name, "is for tasks of dm_control's suite", value=value)
             )
     return PixelEnvironment(simulator, **settings)
+
+
+def make_recorded(
+    task: str, *, image_size: int | None, **settings: Any
+) -> PixelEnvironment:
+    """Makes an environment of the task's own observation, to record a policy in it.
+
+    That is a state vector, or the image where there is none.
+
+    Args:
+      task: see `make_environment`, as for what is raised and `settings`.
+      image_size: of the images that are recorded. None: the task's own, up to 160
+        pixels and if they are square; otherwise 84. Resized twice, to a file's size
+        and to the agent's, they would differ from what the agent sees, and a
+        discriminator could tell them by that.
+    """
+
+    def make(side: int) -> PixelEnvironment:
+        try:
+            return make_environment(
+                task, image_size=side, observation="state", **settings
+            )
+        except ValueError:  # it observes images alone
+            return make_environment(task, image_size=side, frame_stack=1, **settings)
+
+    environment = make(image_size or _RECORDED_SIZE)
+    if image_size or is_of_suite(task):
+        return environment
+    environment.reset(episode=0)
+    side = environment.own_image_size
+    if side is None or side == _RECORDED_SIZE or side > _LARGEST_RECORDED:
+        return environment
+    environment.close()
+    return make(side)
 
 
 @functools.cache
