@@ -72,7 +72,7 @@ class ExpertBatch(NamedTuple):
 
     Attributes:
       observation: uint8 [B, H, W, C], or float32 [B, S].
-      action: the expert's. Shape [B, A]; zeros where unknown. Read only by methods
+      action: the expert's. Shape [B, A]; [B, 0] where unknown. Read only by methods
         that declare that they see actions.
       successor: the next observation; None unless the method asks for it.
     """
