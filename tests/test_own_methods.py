@@ -7,6 +7,7 @@ import pytest
 
 from jaxil import config as jaxil_config
 from jaxil.errors import UsageError
+from jaxil.presets import tiny
 from jaxil.training import agent
 from tests.commands import ROOT, run
 
@@ -58,6 +59,13 @@ def test_a_range_may_have_one_end(write):
     low = run("launch", "--config=flat:walker_walk", "--config.flat.weight=0")
     assert low.returncode == 2
     assert "flat.weight=0.0 must lie in [1.0, inf]; each reward" in low.stderr
+
+
+def test_the_small_preset_sets_only_declared_fields(write):
+    old = '"flat": {"weight": methods.Field(1.0, "each reward", 1.0)}'
+    new = '"discriminator": {"hidden_dim": methods.Field(333, "width", 1)}'
+    config = tiny.get_config(f"{write('sectioned', old, new)},walker_walk")
+    assert config.discriminator.to_dict() == {"hidden_dim": 256}
 
 
 @pytest.mark.parametrize(

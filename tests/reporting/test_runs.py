@@ -288,6 +288,16 @@ def test_unusual_runs_and_limited_comparisons_are_reported(found):
     assert "missing" not in tables.seed_table(made, None).rows[0]
 
 
+def test_fields_of_one_method_alone_are_no_difference(tmp_path):
+    read = [
+        runs.read(write_run(tmp_path / method, method, "walker_walk", 0, {1000: 1.0}))
+        for method in ("pdac", "psil")
+    ]
+    assert not any(
+        "differ" in line for line in remarks.remarks(groups.make_groups(read))
+    )
+
+
 def test_looks_are_one_colour_for_a_method_and_differ_within_it(found):
     read = [run for run in found.values() if not isinstance(run, str)]
     looks = {group.label: group.look for group in groups.make_groups(read)}
