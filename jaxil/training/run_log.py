@@ -119,12 +119,6 @@ class Outputs:
         last_frame, last_seconds = self._last
         speed = (frame - last_frame) / max(seconds - last_seconds, 1e-9)
         self._last = (frame, seconds)
-        unknown = sorted(set(metrics) - {*TRAIN_COLUMNS, *self._metrics})
-        if unknown:
-            raise ValueError(
-                f"{self._config.method} returns metrics that it does not declare: "
-                f"{', '.join(unknown)}; name them in METHOD.metrics"
-            )
         self._write_training(
             frame,
             seconds,
@@ -213,6 +207,12 @@ class Outputs:
     def _write_training(
         self, frame: int, seconds: float, episode: int, values: Mapping[str, Any]
     ) -> None:
+        unknown = sorted(set(values) - {*TRAIN_COLUMNS, *self._metrics})
+        if unknown:
+            raise ValueError(
+                f"{self._config.method} returns metrics that it does not declare: "
+                f"{', '.join(unknown)}; name them in METHOD.metrics"
+            )
         row = {"seconds": round(seconds, 3), "episode": episode, **values}
         with writes_to(self._workdir):
             self._write_scalars("train", frame, row)
