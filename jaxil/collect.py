@@ -32,7 +32,7 @@ from typing import Any
 from absl import flags
 
 from jaxil import command
-from jaxil.errors import UsageError, unknown_name
+from jaxil.errors import Fault, UsageError, unknown_name
 
 _NUM_EVAL_EPISODES = 10
 _SEED = 777  # of the recording environment; no training or evaluation uses it
@@ -100,7 +100,9 @@ def _record_policy(values: flags.FlagValues) -> None:
     from jaxil.environments import suite, tasks
 
     known = suite.known_tasks()
-    if tasks.is_of_suite(values.task or "") and values.task not in known:
+    if not values.task:
+        raise UsageError(Fault("--task", "is missing", "name the policy's task"))
+    if tasks.is_of_suite(values.task) and values.task not in known:
         raise UsageError(unknown_name("--task", values.task, known))
     act = outside.load(values.policy, "--policy")
     settings = {"seed": _SEED, "action_repeat": values.action_repeat}

@@ -19,7 +19,7 @@ from absl import flags
 from jaxil import config as jaxil_config
 from jaxil import methods, outside, presets
 from jaxil.config import Config
-from jaxil.errors import Fault, UsageError, unknown_name
+from jaxil.errors import Fault, UsageError, raised, unknown_name
 from jaxil.files.settings import flat
 
 Define = Callable[[flags.FlagValues], None]
@@ -245,21 +245,21 @@ def _config_of_file(value: str) -> Config:
                 value,
             )
         )
+    own_name = f"preset_{path.stem}"  # may be called as any module is
     spec = importlib.util.spec_from_loader(
-        path.stem, importlib.machinery.SourceFileLoader(path.stem, str(path))
+        own_name, importlib.machinery.SourceFileLoader(own_name, str(path))
     )
     assert spec is not None
     assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
+    module = sys.modules[own_name] = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
         config = module.get_config(*([argument] if colon else []))
     except UsageError:
         raise
     except Exception as error:  # whatever the user's file raises
-        reason = (str(error).strip() or type(error).__name__).splitlines()[-1]
         raise UsageError(
-            Fault("--config", f"cannot be loaded: {reason}", value=value)
+            Fault("--config", f"cannot be loaded: {raised(error)}", value=value)
         ) from error
     if not isinstance(config, ml_collections.ConfigDict):
         rule = "has a get_config() that does not return a ConfigDict"

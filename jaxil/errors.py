@@ -2,12 +2,17 @@
 
 import dataclasses
 import difflib
+import pathlib
+import sysconfig
+import traceback
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 _SHORT_LIST = 20
 _MAX_VALUE, _MAX_FAULT = 200, 4000  # characters shown
 _ABSENT = object()
+_PACKAGE = str(pathlib.Path(__file__).parent)
+_NOT_OWN = (_PACKAGE, *(sysconfig.get_path(n) for n in ("stdlib", "purelib")), "<")
 
 
 def printable(text: object, max_length: int = 1000) -> str:
@@ -69,6 +74,18 @@ class UsageError(Exception):
         if len(shown) == 1:
             return shown[0]
         return "Invalid configuration:\n" + "\n".join(f"  - {f}" for f in shown)
+
+
+def raised(error: BaseException) -> str:
+    """Returns what the user's code raised, and where: its last own file and line."""
+    text = f"{type(error).__name__}: {str(error).strip()}".rstrip(": ")
+    if isinstance(error, SyntaxError) and error.filename:
+        return text  # it ends with file and line
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if not frame.filename.startswith(_NOT_OWN)]
+    if not own:
+        return text
+    return f"{text} ({pathlib.Path(own[-1].filename).name}, line {own[-1].lineno})"
 
 
 def unknown_name(subject: str, value: object, known: Sequence[str]) -> Fault:

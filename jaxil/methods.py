@@ -22,7 +22,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from jaxil import outside
-from jaxil.errors import Fault, UsageError, unknown_name
+from jaxil.errors import Fault, UsageError, raised, unknown_name
 
 _FOLDER = pathlib.Path(__file__).parent / "rewarders"
 _ENTRY_POINTS = "jaxil.methods"
@@ -281,7 +281,7 @@ def _declaration(reference: str) -> Method:
             method = getattr(importlib.import_module(module), name or "METHOD", None)
     except (Exception, SystemExit) as error:  # whatever is wrong with the file
         raise UsageError(
-            Fault("method", f"cannot be loaded: {error!r}", value=reference)
+            Fault("method", f"cannot be loaded: {raised(error)}", value=reference)
         ) from error
     if not isinstance(method, Method):
         raise UsageError(
@@ -297,7 +297,7 @@ def _declaration(reference: str) -> Method:
 @functools.cache
 def _assignment(path: pathlib.Path, name: str) -> ast.expr | None:
     """Returns the value that a file's top level assigns to a name."""
-    for node in ast.parse(path.read_text()).body:
+    for node in ast.parse(path.read_text(), str(path)).body:
         if isinstance(node, ast.Assign) and any(
             isinstance(target, ast.Name) and target.id == name
             for target in node.targets

@@ -8,7 +8,7 @@ config, or with `--trust`.
 import importlib
 from typing import Any
 
-from jaxil.errors import Fault, UsageError, printable
+from jaxil.errors import Fault, UsageError, printable, raised
 
 _trusted: set[str] = set()
 
@@ -30,7 +30,7 @@ def load(reference: str, subject: str) -> Any:
         raise UsageError(
             Fault(
                 subject,
-                f"cannot be loaded ({type(error).__name__}: {error})",
+                f"cannot be loaded: {raised(error)}",
                 "write package.module:name, and add the package's folder to PYTHONPATH",
                 reference,
             )

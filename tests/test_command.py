@@ -119,6 +119,24 @@ def test_fields_that_a_file_misspells_are_named(tmp_path):
     assert "'discriminator.hiden_dim' is unknown" in second
 
 
+@pytest.mark.parametrize(
+    ("lines", "shown"),
+    [
+        ("    raise KeyError('gamma')", "KeyError: 'gamma' (own.py, line 6)"),
+        ("    return", "does not return a ConfigDict"),
+        ("    return (", "SyntaxError: '(' was never closed (own.py, line 6)"),
+    ],
+)
+def test_a_file_that_fails_says_where(lines, shown, tmp_path):
+    """The dataclass needs its module to be known to Python, as any import does."""
+    (tmp_path / "own.py").write_text(
+        "from __future__ import annotations\nimport dataclasses\n"
+        f"@dataclasses.dataclass\nclass Size: side: int\ndef get_config():\n{lines}\n"
+    )
+    (fault,) = _faults(f"--config={tmp_path}/own.py")
+    assert shown in fault
+
+
 def test_switches():
     assert _parse(PDAC, "--nostart").start is False
     assert _parse(PDAC, "--start=false").start is False

@@ -312,4 +312,4 @@ def test_a_broken_installed_method_is_named_and_the_others_work(package):
     assert "'gone' is left out" in left_out
     assert "'no_such_module'" in left_out
     assert "'broken' is left out" in also_left_out
-    assert "cannot be loaded: SystemExit(3)" in refused
+    assert "cannot be loaded: SystemExit: 3 (broken.py, line " in refused

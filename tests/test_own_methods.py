@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from jaxil import config as jaxil_config
+from jaxil import presets
 from jaxil.errors import UsageError
 from jaxil.presets import tiny
 from jaxil.training import agent
@@ -59,6 +60,18 @@ def test_a_range_may_have_one_end(write):
     low = run("launch", "--config=flat:walker_walk", "--config.flat.weight=0")
     assert low.returncode == 2
     assert "flat.weight=0.0 must lie in [1.0, inf]; each reward" in low.stderr
+
+
+def test_its_module_is_a_preset(write):
+    name = write("named")
+    config = presets.get_config("named", "METHOD:walker_walk")
+    assert config == jaxil_config.default_config(name, "walker_walk")
+
+
+def test_a_file_that_cannot_be_read_says_where(write):
+    name = write("open_ended", "1.0)}}", "1.0)}")
+    with pytest.raises(UsageError, match=r"SyntaxError.*\(open_ended.py, line \d+\)"):
+        presets.get_config("tiny", f"{name},walker_walk")
 
 
 def test_the_small_preset_sets_only_declared_fields(write):

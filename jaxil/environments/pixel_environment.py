@@ -62,14 +62,8 @@ class PixelEnvironment(dm_env.Environment):
         self._frames: list[np.ndarray] = []  # of the observation
         self._frame_stack = frame_stack
         bounds = simulator.action_spec()
-        if not isinstance(bounds, specs.BoundedArray) or len(bounds.shape) != 1:
-            raise ValueError(f"has actions {bounds}, but needs a bounded vector.")
-        low, high = (
-            np.broadcast_to(x, bounds.shape) for x in (bounds.minimum, bounds.maximum)
-        )
-        bounded = (np.abs(low) < _UNBOUNDED) & (np.abs(high) < _UNBOUNDED)
-        self._action_low = np.where(bounded, low, -1.0).astype(np.float64)
-        self._action_high = np.where(bounded, high, 1.0).astype(np.float64)
+        self._action_low, self._action_high = _action_range(bounds)
+        self._action_dtype = bounds.dtype
         self._action_spec = specs.BoundedArray(
             shape=bounds.shape,
             dtype=np.float32,
@@ -124,12 +118,13 @@ class PixelEnvironment(dm_env.Environment):
             raise ValueError(f"action has shape {action.shape}, expected {expected}.")
         half_range = (self._action_high - self._action_low) / 2.0
         control = self._action_low + (action + 1.0) * half_range
+        control = control.astype(self._action_dtype)
         reward, discount, is_last = 0.0, 1.0, False
         for _ in range(self._action_repeat):
             inner = self._simulator.step(control)
             self._seen = inner.observation
-            reward += float(inner.reward)
-            discount *= float(inner.discount)
+            reward += _number("reward", inner.reward, -math.inf, math.inf)
+            discount *= _number("discount", inner.discount, 0.0, 1.0)
             self._frames_played += 1
             is_last = inner.last() or self._frames_played >= self._frame_limit
             if is_last:
@@ -216,12 +211,16 @@ class PixelEnvironment(dm_env.Environment):
     def _rendered(self, side: int) -> np.ndarray:
         render = getattr(self._simulator, "render", None)
         if render is None:
-            raise ValueError("neither observes one RGB image nor offers render().")
+            raise ValueError(
+                f"neither observes one uint8 [H, W, 3] nor offers render(); it "
+                f"observes {_described(self._seen)}"
+            )
         scales = getattr(self._simulator, "renders_any_size", False)
         image = np.asarray(render(side) if scales else render())
         if not _is_image(image):
-            shape = f"{image.dtype} {image.shape}"
-            raise ValueError(f"renders {shape}, but uint8 [H, W, 3] is expected.")
+            raise ValueError(
+                f"renders {_described(image)}, but uint8 [H, W, 3] is expected"
+            )
         return image
 
     def _state(self) -> np.ndarray:
@@ -241,6 +240,44 @@ def flat_state(observation: Any) -> np.ndarray:
     """Returns a task's own observation, without images, as float32 [S]."""
     flat = [np.ravel(part) for part in _states_in(observation)]
     return np.concatenate(flat).astype(np.float32)
+
+
+def _action_range(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the smallest and largest actions; -1 and 1 where there are no limits."""
+    if not isinstance(bounds, specs.BoundedArray) or len(bounds.shape) != 1:
+        raise ValueError(f"has actions {bounds}, but needs a bounded vector")
+    if not np.issubdtype(bounds.dtype, np.floating):
+        raise ValueError(f"has actions of {bounds.dtype}, but needs floats")
+    low, high = (
+        np.broadcast_to(x, bounds.shape).astype(np.float64)
+        for x in (bounds.minimum, bounds.maximum)
+    )
+    below, above = np.abs(low) < _UNBOUNDED, np.abs(high) < _UNBOUNDED
+    if np.any(below != above):
+        raise ValueError(f"has actions with one limit alone: {bounds}; give both")
+    return np.where(below, low, -1.0), np.where(below, high, 1.0)
+
+
+def _number(name: str, value: Any, low: float, high: float) -> float:
+    """Returns what a task's step gave as a float, if it is one in the range.
+
+    Raises:
+      ValueError: it is not, which dm_env allows for a reset alone.
+    """
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not (math.isfinite(number) and low <= number <= high):
+        expected = "0 if there is none" if math.isinf(high) else "in [0, 1]"
+        raise ValueError(f"its step has {name} {value!r}; give a number, {expected}")
+    return number
+
+
+def _described(observation: Any) -> str:
+    """Returns types and shapes, for messages."""
+    parts = [np.asarray(part) for part in _parts(observation)]
+    return ", ".join(f"{part.dtype}{list(part.shape)}" for part in parts) or "nothing"
 
 
 def _parts(observation: Any) -> list[Any]:

@@ -131,6 +131,7 @@ class Player:
                 if index in self._open:
                     self._step(index, action)
                     self._receive(index)
+                    self._forget_ended(index)
         if begun and not self._open:  # all were lost
             return self.begin(wanted)
         return bool(begun)
@@ -190,6 +191,17 @@ class Player:
     def _receive(self, index: int) -> None:
         moment = self._environments.receive(index)
         if moment is None:  # lost, and the episode with it
-            self._waiting[self._open.pop(index).number] = np.zeros((0, 0))
+            self._begin_anew(index)
         else:
             self._open[index].add(moment)
+
+    def _forget_ended(self, index: int) -> None:
+        """Drops an episode that ended earlier than when it was first played.
+
+        Its task cannot be seeded, so it did not begin as before.
+        """
+        if index in self._open and self._open[index].is_last:
+            self._begin_anew(index)
+
+    def _begin_anew(self, index: int) -> None:
+        self._waiting[self._open.pop(index).number] = np.zeros((0, 0))

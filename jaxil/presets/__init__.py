@@ -1,7 +1,8 @@
 """Presets by name: `--config=NAME[:ARGUMENT]`.
 
-`METHOD:TASK` gives the paper's settings for any known method; each module of this
-folder is one more preset. The repository's `configs/` hold the same presets as files.
+`METHOD:TASK` gives the paper's settings for any method, a known one's name or
+`package.module:METHOD`; each module of this folder is one more preset. The repository's
+`configs/` hold the same presets as files.
 """
 
 import importlib
@@ -25,9 +26,9 @@ def get_config(name: str, argument: str | None = None) -> Config:
     """Returns the settings of a preset.
 
     Args:
-      name: one of `names()`.
-      argument: METHOD,TASK of `tiny`, TASK of the others; None for the preset's own
-        default.
+      name: one of `names()`, or the module of a method of one's own.
+      argument: METHOD,TASK of `tiny`, METHOD:TASK of a module, TASK of the others; None
+        for the preset's own default.
 
     Raises:
       UsageError: there is no such preset, or the argument is wrong.
@@ -37,4 +38,7 @@ def get_config(name: str, argument: str | None = None) -> Config:
         return module.get_config(*([] if argument is None else [argument]))
     if name in methods.known():
         return jaxil_config.default_config(name, argument or _DEFAULT_TASK)
+    method, colon, task = (argument or "").partition(":")
+    if colon:
+        return jaxil_config.default_config(f"{name}:{method}", task)
     raise UsageError(unknown_name("--config", name, names()))

@@ -132,6 +132,13 @@ def test_an_open_episode_whose_environment_is_lost_meanwhile_starts_again():
     assert made.received == 3 + 6
 
 
+def test_an_open_episode_that_now_ends_sooner_starts_again():
+    """As in a task that cannot be seeded: its end must not be run through."""
+    actions = np.zeros((3, 1), np.float32)
+    player = Player(environments([2], 1), first_episode=1, open_episodes={0: actions})
+    assert assert_plain(play(player, 1), [2]) == [0]
+
+
 def test_what_is_seen_and_what_ends_come_by_number_not_by_environment():
     # Environment 0 is free first, and plays episode 2 beside episode 1.
     player = Player(environments([1, 3, 2], 2), first_episode=0)
