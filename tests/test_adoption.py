@@ -21,37 +21,6 @@ from jaxil.machine.cache import cache_folder
 from tests.commands import ROOT, small
 from tests.processes import wait_for
 
-_METHOD = '''
-"""Rewards pictures that are as bright as the expert's."""
-
-import jax.numpy as jnp
-
-from jaxil import methods
-from jaxil.learner.rewarder import Rewarder
-
-METHOD = methods.Method(
-    name="bright",
-    label="Brightness",
-    about="closeness to the expert's brightness",
-    sections={"brightness": {"weight": methods.Field(1.0, "of rewards", 0.0, 10.0)}},
-    metrics=("brightness/weight",),
-)
-
-
-def make_rewarder(agent, *, weight):
-    def brightness(frames):
-        return jnp.mean(jnp.asarray(frames, jnp.float32) / 255.0, axis=(-1, -2, -3))
-
-    def rewards(state, learner, episode, expert_episodes):
-        wanted = jnp.mean(brightness(expert_episodes.frames))
-        return -weight * jnp.abs(brightness(episode.frames[1:]) - wanted)
-
-    return Rewarder(
-        rewards,
-        matches_episodes=True,
-        summary=lambda state: {"brightness/weight": weight},
-    )
-'''
 _RECORD = """
 import av
 import gymnasium
@@ -69,7 +38,10 @@ with av.open("my_video.mp4", "w") as file:
         state, *_ = environment.step([1.5 * state[1] + 0.9 * state[3]])
     file.mux(stream.encode())
 """
-_POLICY = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+_POLICY, _METHOD = (
+    re.search(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
+    for page in ("README.md", "docs/own.md")
+)
 _TASK = "gymnasium:InvertedPendulum-v5"
 _PENDULUM = (
     "--config.demonstrations.num_episodes=1",
@@ -172,13 +144,13 @@ def test_a_wheel_is_enough(home, monkeypatch):
     assert "True" in run("python", "script.py")
     (home / "runs" / "quickstart").unlink()
 
-    (home / "my_method.py").write_text(_METHOD)
+    assert _METHOD is not None
+    (home / "my_method.py").write_text(_METHOD[1])
     monkeypatch.setenv("PYTHONPATH", str(home))
     run(
         "jaxil",
         "train",
-        f"--config=tiny:pdac,{_TASK}",
-        "--config.method=my_method:METHOD",
+        f"--config=tiny:my_method:METHOD,{_TASK}",
         "--config.demonstrations.source=my_video.mp4",
         "--workdir=~/runs/y",
         *small("zero"),
@@ -191,7 +163,7 @@ def test_a_wheel_is_enough(home, monkeypatch):
 
     run("jaxil", "report", "runs", "--output=report", "--trust=my_method:METHOD")
     page = (home / "report" / "index.html").read_text()
-    for words in ("P-DAC", "cartpole_swingup", "Brightness", _TASK):
+    for words in ("P-DAC", "cartpole_swingup", "Brightness", "brightness/weight", _TASK):
         assert words in page
 
 

@@ -8,7 +8,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jax import Array
 
-from jaxil.networks.layers import MLP, Trunk
+from jaxil.networks.layers import MLP, Trunk, orthogonal
 
 
 class Discriminator(nn.Module):
@@ -89,6 +89,6 @@ class PatchDiscriminator(nn.Module):
         layers = (self.width, 2), (2 * self.width, 1), (4 * self.width, 1), (1, 1)
         for number, (features, stride) in enumerate(layers):
             x = nn.leaky_relu(x, 0.2) if number else x
-            initial = nn.initializers.orthogonal(math.sqrt(2.0))
+            initial = orthogonal(math.sqrt(2.0))
             x = nn.Conv(features, (4, 4), stride, padding=1, kernel_init=initial)(x)
         return x.reshape(len(x), -1)

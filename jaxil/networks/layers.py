@@ -5,6 +5,7 @@ from typing import Any
 
 import chex
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -12,6 +13,23 @@ from jaxil.maths import convolution, products
 from jaxil.native.encoding import Weights
 
 _LAYER_NORM_EPSILON = 1e-5  # PyTorch's default; flax's own is 1e-6
+
+
+def orthogonal(scale: float = 1.0) -> nn.initializers.Initializer:
+    """Returns flax's orthogonal initialiser, which draws one matrix after another.
+
+    Under `vmap` flax's would factorise a batch of matrices, for which jaxlib blocks a
+    thread of XLA's pool until other threads of it have done their share: on two cores
+    two such batches waited for each other for ever (jaxlib 0.10.2, two inverse models
+    of width 1024).
+    """
+    initialise = nn.initializers.orthogonal(scale)
+
+    def draw(key: Array, shape: Any, dtype: Any = jnp.float32) -> Array:
+        one = jax.custom_batching.sequential_vmap(lambda k: initialise(k, shape, dtype))
+        return one(key)
+
+    return draw
 
 
 def dense(features: int, name: str | None = None, dtype: Any = jnp.float32) -> nn.Dense:
@@ -23,7 +41,7 @@ def dense(features: int, name: str | None = None, dtype: Any = jnp.float32) -> n
     """
     return nn.Dense(
         features,
-        kernel_init=nn.initializers.orthogonal(),
+        kernel_init=orthogonal(),
         name=name,
         dtype=dtype,
         dot_general=products.dot_general,
@@ -48,8 +66,7 @@ class ConvolutionReLU(nn.Module):
     def weights(self, channels: int) -> Weights:
         """Returns the parameters for images with this number of channels."""
         shape = (self.kernel_size, self.kernel_size, channels, self.features)
-        orthogonal = nn.initializers.orthogonal(scale=math.sqrt(2.0))
-        kernel = self.param("kernel", orthogonal, shape)
+        kernel = self.param("kernel", orthogonal(math.sqrt(2.0)), shape)
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
         return Weights(kernel, bias)
 

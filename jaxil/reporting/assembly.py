@@ -51,6 +51,7 @@ def write_report(
         "bars": charts.bar_sheet(finals, name="final_returns"),
         "distance": distance,
         "logits": charts.logit_sheet(groups, name="logits"),
+        "metrics": charts.metric_sheet(groups, name="metrics"),
     }
     settings = tables.settings_table(groups)
     on_page = [

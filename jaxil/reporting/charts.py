@@ -1,4 +1,4 @@
-"""Figures with a panel for each task: learning curves, last returns, logits."""
+"""Figures with panels by task: learning curves, last returns, what methods log."""
 
 import functools
 from collections.abc import Sequence
@@ -10,6 +10,7 @@ from jaxil.reporting.sheets import Panel, Sheet
 
 _RETURN = "task_return_mean"
 _LOGITS = ("discriminator/expert_logit", "discriminator/agent_logit")
+_NOT_OF_METHODS = ("critic/", "actor/", "batch/", "replay/", *_LOGITS)
 
 
 def curve_sheet(
@@ -93,6 +94,30 @@ def logit_sheet(groups: Sequence[Group], *, name: str) -> Sheet | None:
         "(dotted) transitions, mean over seeds; label 1 is the expert."
     )
     return _sheet(name, panels, shown, caption)
+
+
+def metric_sheet(groups: Sequence[Group], *, name: str) -> Sheet | None:
+    """Plots what the methods log of themselves over frames; None without any."""
+    panels, found = [], []
+    for task, task_groups in tasks_of(groups).items():
+        tables = [run.training for group in task_groups for run in group.runs]
+        columns = dict.fromkeys(column for table in tables for column in table)
+        for column in columns:
+            if "/" not in column or column.startswith(_NOT_OF_METHODS):
+                continue
+            lines = [
+                measures.curve(group, "frame", column, table="training")
+                for group in task_groups
+            ]
+            shown = [line for line in lines if line is not None]
+            if shown:
+                found += [line.group for line in shown]
+                draw = functools.partial(
+                    plots.curves, lines=shown, over="frame", name=column
+                )
+                panels.append(Panel(f"{task}: {column}", draw))
+    caption = "The methods' own columns of train.csv, mean over seeds and its interval."
+    return _sheet(name, panels, found, caption)
 
 
 def _sheet(

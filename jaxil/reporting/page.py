@@ -19,8 +19,8 @@ def html(content: dict[str, Any]) -> bytes:
     Args:
       content: what the template names: heading, reload_seconds (or None), facts
         (numbers with what they count), shared (settings unlike the paper's), legend,
-        settings (a table), by_frames, by_hours, bars, distance and logits (sheets or
-        None), paper (`PaperFigure`s), episodes, tables and remarks.
+        settings (a table), by_frames, by_hours, bars, distance, logits and metrics
+        (sheets or None), paper (`PaperFigure`s), episodes, tables and remarks.
     """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(pathlib.Path(__file__).parent),

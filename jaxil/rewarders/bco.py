@@ -73,7 +73,11 @@ def make_rewarder(
         return init_module(params, optax.adam(learning_rate))
 
     return Rewarder(
-        zero_rewards, init, expert_batch_size=batch_size, samples_successors=True
+        zero_rewards,
+        init,
+        expert_batch_size=batch_size,
+        samples_successors=True,
+        rewards_transitions=True,
     )
 
 

@@ -143,7 +143,11 @@ def make_rewarder(
         return LatentState(live, copy_params(embed))
 
     return Rewarder(
-        zero_rewards, init, expert_batch_size=batch_size, samples_successors=True
+        zero_rewards,
+        init,
+        expert_batch_size=batch_size,
+        samples_successors=True,
+        rewards_transitions=True,
     )
 
 

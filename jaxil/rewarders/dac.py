@@ -129,5 +129,10 @@ def make_rewarder(
         return logits(state.params, x)
 
     return Rewarder(
-        rewards, init, update, expert_batch_size=batch_size, relabel=relabel
+        rewards,
+        init,
+        update,
+        expert_batch_size=batch_size,
+        rewards_transitions=True,
+        relabel=relabel,
     )

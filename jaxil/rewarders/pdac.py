@@ -183,5 +183,6 @@ def make_rewarder(
         observe,
         expert_batch_size=batch_size,
         matches_episodes=bool(num_components),
+        rewards_transitions=True,
         rewards_changed=lambda state: True,
     )

@@ -2,6 +2,7 @@
 
 import inspect
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -29,9 +30,10 @@ from jaxil.learner.update import (
     init_train_state,
     make_update_step,
 )
-from jaxil.maths.types import ExpertEpisodes
+from jaxil.maths.types import Episode, ExpertEpisodes
 from jaxil.native import build, encoding
 from jaxil.networks.agent import AgentNetworks, make_agent_networks
+from jaxil.training import lengths
 
 
 class Agent(NamedTuple):
@@ -45,6 +47,8 @@ class Agent(NamedTuple):
       mean_action: see `policy.make_mean_action`.
       observe: the rewarder's.
       rewards: the rewarder's.
+      compiled_length: (T) -> the length for which `rewards` and `refresh` of an episode
+        of T steps are compiled.
       refresh: rewards of stored episodes as of now, see `rewarder.make_refresh`.
       plan: the rewarder's; None where it has none.
       rewarder: the method itself.
@@ -59,6 +63,7 @@ class Agent(NamedTuple):
     mean_action: MeanAction
     observe: Any
     rewards: Any
+    compiled_length: Callable[[int], int]
     refresh: Any
     plan: Any
     rewarder: Rewarder
@@ -246,6 +251,18 @@ def make_agent(
         step = make_averaging_step(step, tau=config.policy_tau)
     step = make_gathering_step(step)
 
+    def compiled_length(num_steps: int) -> int:
+        if not rewarder.rewards_transitions:
+            return num_steps
+        return lengths.padded_length(num_steps, environment.episode_steps)
+
+    compiled_rewards = jax.jit(rewarder.rewards)
+
+    def rewards(state: Any, params: Any, episode: Episode, experts: Any) -> np.ndarray:
+        num_steps = len(episode.actions)
+        padded = lengths.pad_episode(episode, compiled_length(num_steps))
+        return np.asarray(compiled_rewards(state, params, padded, experts))[:num_steps]
+
     def init_state() -> TrainState:
         key = jax.random.key(config.seed)
         state = init_train_state(learner, key, observation, spec)
@@ -260,7 +277,8 @@ def make_agent(
         ),
         mean_action=jax.jit(make_mean_action(networks)),
         observe=jax.jit(rewarder.observe),
-        rewards=jax.jit(rewarder.rewards),
+        rewards=rewards,
+        compiled_length=compiled_length,
         refresh=jax.jit(make_refresh(rewarder)),
         plan=None if rewarder.plan is None else jax.jit(rewarder.plan),
         rewarder=rewarder,

@@ -13,6 +13,7 @@ from jaxil.maths.types import Batch, ExpertBatch, ExpertEpisodes, Metrics
 from jaxil.replay.device_copy import DeviceCopy
 from jaxil.replay.replay import Replay
 from jaxil.training.agent import Agent, stack_size
+from jaxil.training.lengths import pad_rows
 
 Sampled = tuple[Batch | None, ExpertBatch | None]
 
@@ -110,19 +111,24 @@ class Updates:
         replay = self._replay
         by_length: dict[int, list[int]] = {}
         for index in replay.episodes:
-            by_length.setdefault(len(replay.slots(index)), []).append(index)
-        for indices in by_length.values():
+            length = self._agent.compiled_length(len(replay.slots(index)) - 1)
+            by_length.setdefault(length, []).append(index)
+        for length, indices in by_length.items():
             for first in range(0, len(indices), _REFRESH_EPISODES):
                 chunk = indices[first : first + _REFRESH_EPISODES]
                 # Always of one size, so that each episode length compiles once.
                 padded = chunk + chunk[-1:] * (_REFRESH_EPISODES - len(chunk))
-                rewards = self._refreshed(state, padded)[: len(chunk)]
+                rewards = self._refreshed(state, padded, length)[: len(chunk)]
                 for index, new in zip(chunk, rewards, strict=True):
-                    replay.replace_rewards(index, new)
+                    replay.replace_rewards(index, new[: len(replay.slots(index)) - 1])
 
-    def _refreshed(self, state: TrainState, indices: list[int]) -> np.ndarray:
-        slots = np.stack([self._replay.slots(index) for index in indices])
-        actions = np.stack([self._replay.actions(index) for index in indices])
+    def _refreshed(
+        self, state: TrainState, indices: list[int], length: int
+    ) -> np.ndarray:
+        """Returns new rewards, [E, length], of episodes that are at most that long."""
+        replay = self._replay
+        slots = np.stack([pad_rows(replay.slots(i), length + 1) for i in indices])
+        actions = np.stack([pad_rows(replay.actions(i), length) for i in indices])
         if self._device_copy is not None:
             frames = self._device_copy.frames
         else:

@@ -16,7 +16,7 @@ EVAL_HEADER = (
 )
 _TRAIN_HEADER = (
     "frame,seconds,episode,task_return,imitation_return,length,frames_per_second,"
-    "discriminator/expert_logit,discriminator/agent_logit"
+    "discriminator/expert_logit,discriminator/agent_logit,discriminator/loss"
 )
 
 
@@ -62,7 +62,7 @@ def write_run(
     if logits:
         rows = [
             f"{frame},{3.6 * frame},{frame // 500},1.0,2.0,250,0.3,{frame / 1000},"
-            f"{-frame / 1000}"
+            f"{-frame / 1000},0.5"
             for frame in range(500, max(returns) + 1, 500)
         ]
         (folder / "train.csv").write_text("\n".join([_TRAIN_HEADER, *rows]) + "\n")

@@ -1,10 +1,17 @@
 """From a config to the functions of an agent."""
 
+from typing import Any
+
+import flax.linen as nn
+import jax
 import numpy as np
 import pytest
 
 from jaxil import config as jaxil_config
+from jaxil import methods
+from jaxil.networks.layers import orthogonal
 from jaxil.training import agent
+from tests.training.drawing import Drawing, make_config, make_demonstrations
 
 
 def test_the_learning_rate_is_constant_by_default():
@@ -38,3 +45,22 @@ def test_updates_draw_the_noise_of_their_agent_step(every, at_once):
     for step in (0, 8, 40, 500):  # after the first update
         num_updates = step // every * at_once
         np.testing.assert_allclose(by_update(num_updates), by_step(20 + step))
+
+
+@pytest.mark.parametrize("method", methods.known())
+def test_no_first_weights_are_factorised_in_batches(method):
+    """Two batches at once waited for each other for ever on two cores."""
+    environment: Any = Drawing()
+    made = agent.make_agent(make_config(method), environment, make_demonstrations())
+    lowered = made.init_state.lower().as_text()
+    assert 'num_batch_dims = "0"' in lowered
+    assert 'num_batch_dims = "1"' not in lowered
+
+
+def test_several_networks_get_the_weights_that_each_would_get_alone():
+    keys = jax.random.split(jax.random.key(0), 3)
+    drawn = jax.vmap(lambda key: orthogonal(2.0)(key, (5, 4)))(keys)
+    for key, weights in zip(keys, drawn, strict=True):
+        alone = nn.initializers.orthogonal(2.0)(key, (5, 4))
+        np.testing.assert_array_equal(weights, alone)
+        np.testing.assert_allclose(weights.T @ weights, 4.0 * np.eye(4), atol=1e-5)

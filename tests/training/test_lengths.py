@@ -1,0 +1,88 @@
+"""Episodes of any length get the rewards that they would get without padding."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxil import methods
+from jaxil.maths.types import Episode
+from jaxil.training import assembly, lengths
+from jaxil.training.updates import Updates
+from tests.training.drawing import (
+    SIDE,
+    STEPS,
+    Drawing,
+    make_agent,
+    make_config,
+    make_demonstrations,
+)
+
+# These compare whole episodes.
+_MATCHING = {"psil", "psil_cloning", "sil", "temporal_ot", "orca"}
+_PLAYING = {name for name, method in methods.known().items() if method.plays}
+
+
+@given(num_steps=st.integers(1, 3000), longest=st.integers(1, 2000))
+def test_there_are_few_lengths_and_little_padding(num_steps, longest):
+    padded = lengths.padded_length(num_steps, longest)
+    assert num_steps <= padded <= max(num_steps, longest)
+    assert padded <= max(8, 1.5 * num_steps)
+    assert lengths.padded_length(padded, longest) == padded
+
+
+def test_a_thousand_lengths_are_few():
+    found = sorted({lengths.padded_length(n, 1000) for n in range(1, 1001)})
+    assert found[:5] == [8, 12, 16, 24, 32]
+    assert found[-2:] == [768, 1000]
+    assert len(found) == 15
+
+
+def draw_episode(num_steps):
+    rng = np.random.default_rng(num_steps)
+    return Episode(
+        frames=rng.integers(0, 255, (num_steps + 1, SIDE, SIDE, 3), dtype=np.uint8),
+        actions=rng.uniform(-1, 1, (num_steps, 2)).astype(np.float32),
+        rewards=rng.normal(size=num_steps).astype(np.float32),
+        discounts=np.ones(num_steps, np.float32),
+    )
+
+
+def first_steps(episode, num_steps):
+    frames, *others = episode
+    return Episode(frames[: num_steps + 1], *(values[:num_steps] for values in others))
+
+
+@pytest.mark.parametrize("method", sorted(_PLAYING - _MATCHING))
+def test_rewards_of_transitions_do_not_depend_on_what_follows(method):
+    agent, episode = make_agent(method), draw_episode(STEPS)
+    assert agent.compiled_length(9) == 12
+    state = agent.init_state()
+    whole = agent.rewards(state.rewarder, state.params, episode, None)
+    assert whole.shape == (STEPS,)
+    short = first_steps(episode, 9)
+    rewards = agent.rewards(state.rewarder, state.params, short, None)
+    np.testing.assert_allclose(rewards, whole[:9], rtol=1e-4, atol=1e-6)
+
+
+def test_methods_that_compare_whole_episodes_get_them_as_they_are():
+    for method in _MATCHING:
+        assert make_agent(method).compiled_length(9) == 9
+
+
+@pytest.mark.parametrize("on_device", [False, True])
+def test_stored_episodes_of_all_lengths_are_rewarded_anew(on_device):
+    config = make_config("pdac", replay_on_device=on_device, replay_size_steps=100)
+    agent, demonstrations = make_agent("pdac"), make_demonstrations()
+    replay = assembly.make_replay(config, Drawing())
+    episodes = [draw_episode(num_steps) for num_steps in (9, 5, 21, 10, 11, 12, 2)]
+    for episode in episodes:
+        replay.add_episode(**episode._asdict())
+    state, before = agent.init_state(), agent.refresh._cache_size()
+    updates = Updates(config, agent, replay, demonstrations, None)
+    updates.refresh_rewards(state)
+    for number, episode in enumerate(episodes):
+        expected = agent.rewards(state.rewarder, state.params, episode, None)
+        stored = replay.rewards(number)
+        np.testing.assert_allclose(stored, expected, rtol=1e-4, atol=1e-6)
+    assert agent.refresh._cache_size() - before == 3  # of 8, 12 and 21 steps
