@@ -163,7 +163,8 @@ def test_a_wheel_is_enough(home, monkeypatch):
 
     run("jaxil", "report", "runs", "--output=report", "--trust=my_method:METHOD")
     page = (home / "report" / "index.html").read_text()
-    for words in ("P-DAC", "cartpole_swingup", "Brightness", "brightness/weight", _TASK):
+    own = "Brightness", "brightness/weight", _TASK
+    for words in ("P-DAC", "cartpole_swingup", *own):
         assert words in page
 
 

@@ -1,5 +1,7 @@
 """Tasks of one's own that give what no agent can use: one message each."""
 
+from typing import Any
+
 import dm_env
 import numpy as np
 import pytest
@@ -13,7 +15,13 @@ _BLACK = np.zeros((8, 8, 3), np.uint8)
 class Task(dm_env.Environment):
     """Gives what it is told, and keeps the action that it gets."""
 
-    def __init__(self, bounds=None, image=_BLACK, reward=0.0, discount=1.0):
+    def __init__(
+        self,
+        bounds: Any = None,
+        image: Any = _BLACK,
+        reward: Any = 0.0,
+        discount: Any = 1.0,
+    ):
         self._bounds = bounds or specs.BoundedArray((1,), np.float64, -1.0, 1.0)
         self._image, self._reward, self._discount = image, reward, discount
         self.taken = np.zeros(0)
@@ -32,7 +40,7 @@ class Task(dm_env.Environment):
         return self._bounds
 
 
-def bounded(low, high, dtype=np.float64):
+def bounded(low, high, dtype: Any = np.float64):
     return specs.BoundedArray((2,), dtype, np.array(low), np.array(high))
 
 

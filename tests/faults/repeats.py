@@ -50,7 +50,7 @@ def _work(convolutions: str, cores: int, repeats: int, methods: list[str]) -> No
 
     startup.prepare()
 
-    from tests.training import test_updates as runs
+    from tests.training import drawing as runs
 
     runs.SIDE = SIDE
     for method in methods:
@@ -76,17 +76,17 @@ def _computation(method: str, convolutions: str) -> Any:
     from jaxil.training import agent as agents
     from jaxil.training import assembly
     from jaxil.training.updates import Updates
-    from tests.training import test_updates as runs
+    from tests.training import drawing as runs
 
     config = runs.make_config(method, hidden_dim=HIDDEN, batch_size=BATCH)
     config.encoder.channels = (32, 32)
     config.encoder.convolutions = convolutions
     native = agents.uses_native_convolutions(config)
     assert native == (convolutions == "native"), "the encoder in C cannot be had here"
-    drawing: Any = runs.Drawing()
+    environment: Any = runs.Drawing()
     demonstrations = runs.make_demonstrations()
-    agent = agents.make_agent(config, drawing, demonstrations)
-    replay = assembly.make_replay(config, drawing)
+    agent = agents.make_agent(config, environment, demonstrations)
+    replay = assembly.make_replay(config, environment)
     rng = np.random.default_rng(0)
     for frames in demonstrations.frames:
         replay.add_episode(

@@ -1,5 +1,7 @@
 """Episodes of any length get the rewards that they would get without padding."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -74,7 +76,8 @@ def test_methods_that_compare_whole_episodes_get_them_as_they_are():
 def test_stored_episodes_of_all_lengths_are_rewarded_anew(on_device):
     config = make_config("pdac", replay_on_device=on_device, replay_size_steps=100)
     agent, demonstrations = make_agent("pdac"), make_demonstrations()
-    replay = assembly.make_replay(config, Drawing())
+    drawing: Any = Drawing()
+    replay = assembly.make_replay(config, drawing)
     episodes = [draw_episode(num_steps) for num_steps in (9, 5, 21, 10, 11, 12, 2)]
     for episode in episodes:
         replay.add_episode(**episode._asdict())
