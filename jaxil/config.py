@@ -5,13 +5,14 @@ Durations end in their unit: `_frames` are environment frames, before action rep
 (see `jaxil.methods`).
 """
 
+import functools
 import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import ml_collections
 
-from jaxil import methods, outside
+from jaxil import declarations, methods, outside
 from jaxil.demonstrations.settings import DEMONSTRATIONS
 from jaxil.errors import Fault, UsageError, unknown_name
 from jaxil.methods import Field
@@ -184,8 +185,7 @@ def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Conf
         if group and group not in config:
             config[group] = ml_collections.ConfigDict()
         (config[group] if group else config)[leaf] = field.default
-    config.method = method
-    config.task = task
+    config.method, config.task = method, task
     outside.trust(task)
     config.total_frames = _EASY_FRAMES if task in _EASY_TASKS else _HARD_FRAMES
     config.num_steps = 1 if task.startswith("walker") else 3
@@ -199,11 +199,13 @@ def fields(method: str) -> dict[str, Field]:
     """Returns all fields of a method's config by dotted name, in order.
 
     Raises:
-      UsageError: there is no such method.
+      UsageError: there is no such method, or its declaration cannot be used.
     """
+    taken = {name.partition(".")[0] for name in FIELDS}
+    declared = declarations.checked(methods.get(method), taken)
     own = {
         f"{section}.{name}": field
-        for section, members in methods.get(method).sections.items()
+        for section, members in declared.sections.items()
         for name, field in members.items()
     }
     return {**FIELDS, **own}
@@ -211,10 +213,7 @@ def fields(method: str) -> dict[str, Field]:
 
 def read(config: Config, field: str) -> Any:
     """Returns a field by its dotted name."""
-    value = config
-    for part in field.split("."):
-        value = value[part]
-    return value
+    return functools.reduce(lambda value, part: value[part], field.split("."), config)
 
 
 def uses_demonstrations(config: Config) -> bool:

@@ -13,7 +13,7 @@ FLOORS = {
     "errors": -1,
     "outside": 0,
     **dict.fromkeys(("methods", "maths", "machine", "files"), 1),
-    **dict.fromkeys(("native", "replay"), 2),
+    **dict.fromkeys(("native", "replay", "declarations"), 2),
     **dict.fromkeys(("networks", "environments"), 3),
     **dict.fromkeys(("learner", "demonstrations"), 4),
     "rewarders": 5,

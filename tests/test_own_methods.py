@@ -74,6 +74,33 @@ def test_a_file_that_cannot_be_read_says_where(write):
         presets.get_config("tiny", f"{name},walker_walk")
 
 
+def test_all_faults_of_a_declaration_are_one_message(write):
+    old = 'sections={"flat": {"weight": methods.Field(1.0, "each reward", 1.0)}},'
+    new = """sections={
+        "encoder": {"weight": methods.Field(1.0, "")},
+        "flat": {"weight": methods.Field(1.0, ""), "sizes": methods.Field([8], "")},
+        "bare": {"rate": 0.1},
+    },
+    metrics=("mean", "critic/own", "flat/mean"),"""
+    with pytest.raises(UsageError) as refused:
+        jaxil_config.default_config(write("faulty", old, new), "walker_walk")
+    faults = [str(fault) for fault in refused.value.faults]
+    words = [
+        "section 'encoder', which every config has",
+        "'weight' in both 'encoder' and 'flat'",
+        "flat.sizes with the default [8]",
+        "sections['bare']={'rate': 0.1}; give a dict of Field",
+        "metric 'mean'; write GROUP/NAME",
+        "metric 'critic/own'",
+    ]
+    assert len(faults) == len(words)
+    for fault, word in zip(faults, words, strict=True):
+        assert word in fault
+    text = write("texts", "uses_demonstrations", 'metrics=("x/y"),uses_demonstrations')
+    with pytest.raises(UsageError, match="metrics='x/y'; give a tuple"):
+        jaxil_config.default_config(text, "walker_walk")
+
+
 def test_the_small_preset_sets_only_declared_fields(write):
     old = '"flat": {"weight": methods.Field(1.0, "each reward", 1.0)}'
     new = '"discriminator": {"hidden_dim": methods.Field(333, "width", 1)}'
