@@ -60,7 +60,8 @@ class Wanted(NamedTuple):
       fit: one of `frames.FITS`: how frames of other shapes become squares.
       dataset_camera: of a dataset with several.
       stated_action_repeat: of a file of pixels that does not say it; 0 if unknown.
-      takes_fewer: whether fewer episodes than asked for will do.
+      takes_fewer: whether fewer episodes will do, as they do by default unless
+        `num_episodes` is given.
       max_bytes: memory limit for a file of pixels.
     """
 
@@ -88,7 +89,7 @@ def check(
       sees_actions: whether the method needs the expert's actions.
       wanted: the fields of `Wanted`.
     """
-    request = Wanted(**wanted)
+    request = _request(wanted)
     task, path = request.task, _path_of(source, request.task)
     if states.recognises(path):
         _open_states(path, request)
@@ -110,7 +111,7 @@ def returns(source: str | os.PathLike = "", **wanted: Any) -> list[float]:
 
     For the arguments and errors see `load`.
     """
-    request = Wanted(**wanted)
+    request = _request(wanted)
     path = _path_of(source, request.task)
     if states.recognises(path):
         return _returns(_rewards(*_open_states(path, request)))
@@ -143,7 +144,7 @@ def load(
     Raises:
       DemonstrationError: the file cannot be read, is damaged, or does not fit.
     """
-    request = Wanted(**wanted)
+    request = _request(wanted)
     path = _path_of(source, request.task)
     if not states.recognises(path):
         loaded = _load_pixels(path, request)
@@ -189,6 +190,11 @@ def load(
     served = {"file": str(path), "action_repeat": request.action_repeat}
     metadata = {**metadata, **served, "returns": _returns(rewards)}
     return Demonstrations(*found, metadata)
+
+
+def _request(wanted: dict[str, Any]) -> Wanted:
+    """Returns the fields with defaults; a number that nobody asked for may be less."""
+    return Wanted(**{"takes_fewer": "num_episodes" not in wanted, **wanted})
 
 
 def _path_of(source: str | os.PathLike, task: str) -> pathlib.Path:
