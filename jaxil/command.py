@@ -129,7 +129,8 @@ def define_config(values: flags.FlagValues, default: str | None = None) -> None:
         _CONFIG,
         default,
         "METHOD:TASK for the paper's settings, tiny:METHOD,TASK for small ones, "
-        "expert:TASK, or FILE.py[:ARGUMENT] with a get_config(); change a field with "
+        "expert:TASK, package.module:METHOD:TASK for a method of your own, or "
+        "FILE.py[:ARGUMENT] with a get_config(); change a field with "
         "--config.FIELD=VALUE",
         flag_values=values,
     )
@@ -245,7 +246,7 @@ def _config_of_file(value: str) -> Config:
                 value,
             )
         )
-    own_name = f"preset_{path.stem}"  # may be called as any module is
+    own_name = f"preset_{path.stem}"  # the file may be called json.py
     spec = importlib.util.spec_from_loader(
         own_name, importlib.machinery.SourceFileLoader(own_name, str(path))
     )

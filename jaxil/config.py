@@ -13,9 +13,9 @@ from typing import Any
 import ml_collections
 
 from jaxil import declarations, methods, outside
+from jaxil.declarations import Field
 from jaxil.demonstrations.settings import DEMONSTRATIONS
 from jaxil.errors import Fault, UsageError, unknown_name
-from jaxil.methods import Field
 
 # An ml_collections.ConfigDict, whose fields no type checker can know.
 Config = Any
@@ -176,9 +176,13 @@ def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Conf
     """Returns the paper's settings for a method on a task.
 
     Raises:
-      UsageError: there is no such method.
+      UsageError: there is no such method, or a section of it is one of every config.
     """
     declared = methods.get(method)
+    taken = {name.partition(".")[0] for name in FIELDS} & set(declared.sections)
+    if taken:
+        rule = f"has sections that every config has ({', '.join(sorted(taken))})"
+        raise UsageError(Fault("method", rule, "rename them", method))
     config: Config = ml_collections.ConfigDict()
     for name, field in fields(method).items():
         group, _, leaf = name.rpartition(".")
@@ -199,13 +203,11 @@ def fields(method: str) -> dict[str, Field]:
     """Returns all fields of a method's config by dotted name, in order.
 
     Raises:
-      UsageError: there is no such method, or its declaration cannot be used.
+      UsageError: there is no such method.
     """
-    taken = {name.partition(".")[0] for name in FIELDS}
-    declared = declarations.checked(methods.get(method), taken)
     own = {
         f"{section}.{name}": field
-        for section, members in declared.sections.items()
+        for section, members in methods.get(method).sections.items()
         for name, field in members.items()
     }
     return {**FIELDS, **own}
@@ -255,7 +257,7 @@ def _problems(
     bad = set()
     for name, field in known.items():
         value = read(config, name)
-        for fault in _field_problems(name, field, value):
+        for fault in declarations.field_problems(name, field, value):
             bad.add(name)
             yield fault
     for name in _WHOLE_STEPS:
@@ -300,19 +302,6 @@ def _problems(
             True,
         )
     yield from _encoder_problems(config)
-
-
-def _field_problems(name: str, field: Field, value: Any) -> Iterator[Fault]:
-    if field.choices:
-        if value not in field.choices:
-            yield unknown_name(name, value, field.choices)
-    elif field.low is not None or field.high is not None:
-        low = -math.inf if field.low is None else field.low
-        high = math.inf if field.high is None else field.high
-        inside = low <= value <= high  # False for NaN
-        if not inside or (field.positive and value == low):
-            interval = f"{'(' if field.positive else '['}{low}, {high}]"
-            yield Fault(name, f"must lie in {interval}", field.about, value)
 
 
 def _encoder_problems(config: Config) -> Iterator[Fault]:

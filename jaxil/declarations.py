@@ -1,70 +1,160 @@
-"""What is wrong with a method's declaration, all of it at once."""
+"""What a method declares of itself, and whether that can be used."""
 
-from collections.abc import Collection, Iterator, Mapping
-from typing import Any
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
 
-from jaxil.errors import Fault, UsageError
-from jaxil.methods import Field, Method
+from jaxil.errors import Fault, unknown_name
 
-_TYPES = (bool, int, float, str, tuple)  # that flags can be read as
-_LEARNERS = ("critic/", "actor/", "batch/", "replay/")  # columns of train.csv
+# The types of fields that --config.FIELD=TEXT can be read as.
+_TYPES = (bool, int, float, str, tuple)
+# Columns of train.csv that the learner writes begin so, or contain no slash.
+LEARNERS_GROUPS = ("critic/", "actor/", "batch/", "replay/")
 
 
-def checked(method: Method, taken: Collection[str]) -> Method:
-    """Returns the method, if its sections, fields and metrics can be used.
+class Field(NamedTuple):
+    """One setting.
 
-    Args:
-      method: as declared.
-      taken: names of the fields and sections that every config has.
-
-    Raises:
-      UsageError: names every fault.
+    Attributes:
+      default: the paper's value, or the reference's; its type is the field's.
+      about: what it is and what is usual, for `--help` and messages.
+      low: smallest value of a number.
+      high: largest value of a number.
+      choices: of a name; empty if any text will do.
+      positive: whether a number must lie above `low`, not at it.
     """
-    faults = [*_section_problems(method.sections, taken), *_metric_problems(method)]
-    if faults:
-        raise UsageError([Fault("method", f, value=method.name) for f in faults])
-    return method
+
+    default: Any
+    about: str
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+    positive: bool = False
 
 
-def _section_problems(sections: Any, taken: Collection[str]) -> Iterator[str]:
-    if not _is_mapping_of(sections, Mapping):
-        yield f"has sections={sections!r}; give a dict of dicts of Field"
-        return
+class Variation(NamedTuple):
+    """A field that makes an ablation of the method.
+
+    Attributes:
+      field: dotted, such as "sinkhorn.cost".
+      plain: the value of the method itself.
+      words: what figures call another value; "{}" stands for it.
+    """
+
+    field: str
+    plain: Any
+    words: str
+
+
+class Method(NamedTuple):
+    """What the program knows of a method.
+
+    Attributes:
+      name: how configs name it; `get` sets package.module:METHOD if it is not `known`.
+      label: how figures and tables name it.
+      about: what it learns from, in a few words.
+      colour: of its curves, "#rrggbb".
+      rank: its place in tables and legends: small numbers first.
+      sections: its config sections. Their fields are keyword arguments of
+        `make_rewarder`, and of `make_update_step` where there is one, so no two
+        sections may have a field of the same name.
+      make_rewarder: name of a function of its file: (AgentSpec, **fields) -> Rewarder.
+      make_update_step: name of a function of its file that replaces the learner's own
+        step: (Learner, **fields) -> UpdateStep; None for the learner's.
+      uses_demonstrations: whether it imitates anything.
+      sees_actions: whether it reads the expert's actions, or the field that decides.
+      plays: whether the agent acts in the environment; a method that does not learns
+        from demonstrations alone, and an update counts as the frames that an agent
+        would play for it.
+      total_updates: length of a run of a method that does not play.
+      needs_pixels: whether it cannot learn from state vectors.
+      metrics: columns of train.csv beside those of the learner, such as "own/error".
+      variations: fields that make ablations.
+    """
+
+    name: str
+    label: str
+    about: str
+    colour: str = "#5b5b5b"
+    rank: int = 100
+    sections: Mapping[str, Mapping[str, Field]] = {}
+    make_rewarder: str = "make_rewarder"
+    make_update_step: str | None = None
+    uses_demonstrations: bool = True
+    sees_actions: bool | str = False
+    plays: bool = True
+    total_updates: int = 0
+    needs_pixels: bool = False
+    metrics: tuple[str, ...] = ()
+    variations: tuple[Variation, ...] = ()
+
+
+def problems(method: Method) -> Iterator[str]:
+    """Yields each rule that sections, fields or metrics break."""
+    yield from _section_problems(method.sections)
+    own = {
+        f"{section}.{name}"
+        for section, fields in method.sections.items()
+        if isinstance(fields, Mapping)
+        for name in fields
+    }
+    sees = method.sees_actions
+    if isinstance(sees, str) and sees not in own:
+        yield f"has sees_actions={sees!r}, which is none of its fields"
+    yield from _metric_problems(method.metrics)
+
+
+def field_problems(name: str, field: Field, value: Any) -> Iterator[Fault]:
+    """Yields why a field cannot have a value: its choices or its range."""
+    if field.choices:
+        if value not in field.choices:
+            yield unknown_name(name, value, field.choices)
+    elif field.low is not None or field.high is not None:
+        low = -math.inf if field.low is None else field.low
+        high = math.inf if field.high is None else field.high
+        inside = low <= value <= high  # False for NaN
+        if not inside or (field.positive and value == low):
+            interval = f"{'(' if field.positive else '['}{low}, {high}]"
+            yield Fault(name, f"must lie in {interval}", field.about, value)
+
+
+def _section_problems(sections: Any) -> Iterator[str]:
     owners: dict[str, str] = {}
     for section, fields in sections.items():
-        if section in taken:
-            yield f"has a section {section!r}, which every config has; rename it"
-        if not _is_mapping_of(fields, Field):
+        if not isinstance(fields, Mapping) or not all(
+            isinstance(field, Field) for field in fields.values()
+        ):
             yield f"has sections[{section!r}]={fields!r}; give a dict of Field"
             continue
         for name, field in fields.items():
+            if not (section.isidentifier() and name.isidentifier()):
+                yield f"has {section}.{name}; use names as Python's variables have them"
             if name in owners:
                 yield (
                     f"has {name!r} in both {owners[name]!r} and {section!r}, which "
                     "become one keyword; rename one"
                 )
             owners[name] = section
-            if not isinstance(field.default, _TYPES):
+            if type(field.default) not in _TYPES:
                 yield (
-                    f"has {section}.{name} with the default {field.default!r}; flags "
-                    "can be True or False, numbers, text or tuples"
+                    f"has {section}.{name} with the default {field.default!r}; give "
+                    "True or False, a number, text or a tuple"
                 )
+                continue
+            for fault in field_problems(f"{section}.{name}", field, field.default):
+                yield f"has a default that its own rule forbids: {fault}"
 
 
-def _metric_problems(method: Method) -> Iterator[str]:
-    names = method.metrics
-    if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+def _metric_problems(names: Any) -> Iterator[str]:
+    ordered = isinstance(names, tuple | list)
+    if not ordered or not all(isinstance(name, str) for name in names):
         yield f"has metrics={names!r}; give a tuple of names"
         return
-    for name in names:
-        if "/" not in name or name.startswith(_LEARNERS):
+    for name in dict.fromkeys(names):
+        if names.count(name) > 1:
+            yield f"has the metric {name!r} twice"
+        if "/" not in name or name.startswith(LEARNERS_GROUPS):
             yield (
                 f"has a metric {name!r}; write GROUP/NAME, with a group other than the "
-                f"learner's ({', '.join(each[:-1] for each in _LEARNERS)})"
+                f"learner's ({', '.join(each[:-1] for each in LEARNERS_GROUPS)})"
             )
-
-
-def _is_mapping_of(found: Any, kind: Any) -> bool:
-    return isinstance(found, Mapping) and all(
-        isinstance(value, kind) for value in found.values()
-    )

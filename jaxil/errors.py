@@ -11,8 +11,9 @@ from typing import Any
 _SHORT_LIST = 20
 _MAX_VALUE, _MAX_FAULT = 200, 4000  # characters shown
 _ABSENT = object()
-_PACKAGE = str(pathlib.Path(__file__).parent)
-_NOT_OWN = (_PACKAGE, *(sysconfig.get_path(n) for n in ("stdlib", "purelib")), "<")
+_PACKAGE = str(pathlib.Path(__file__).parent / "_")[:-1]  # with the separator
+_STANDARD = sysconfig.get_path("stdlib")
+_INSTALLED = ("site-packages", "dist-packages")  # folders of installed packages
 
 
 def printable(text: object, max_length: int = 1000) -> str:
@@ -77,15 +78,32 @@ class UsageError(Exception):
 
 
 def raised(error: BaseException) -> str:
-    """Returns what the user's code raised, and where: its last own file and line."""
-    text = f"{type(error).__name__}: {str(error).strip()}".rstrip(": ")
-    if isinstance(error, SyntaxError) and error.filename:
-        return text  # it ends with file and line
+    """Returns what code that jaxil called raised, and the user's line nearest to it.
+
+    A ValueError that jaxil itself raised is given as it is: it says what is wrong.
+    """
     frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if not frame.filename.startswith(_NOT_OWN)]
+    files = [frame.filename for frame in frames]
+    if isinstance(error, ValueError) and files and files[-1].startswith(_PACKAGE):
+        return str(error)
+    text = ": ".join(filter(None, (type(error).__name__, str(error).strip())))
+    if isinstance(error, SyntaxError) and not (error.filename or "<").startswith("<"):
+        return text  # it ends with file and line
+    outside = [frame for frame in frames if not _is_known(frame.filename)]
+    own = [f for f in outside if not _is_installed(f.filename)] or outside
     if not own:
         return text
     return f"{text} ({pathlib.Path(own[-1].filename).name}, line {own[-1].lineno})"
+
+
+def _is_installed(file: str) -> bool:
+    return any(part in _INSTALLED for part in pathlib.Path(file).parts)
+
+
+def _is_known(file: str) -> bool:
+    """Returns whether a file is jaxil's, Python's own, or none."""
+    is_pythons = file.startswith(_STANDARD) and not _is_installed(file)
+    return file.startswith(("<", _PACKAGE)) or is_pythons
 
 
 def unknown_name(subject: str, value: object, known: Sequence[str]) -> Fault:

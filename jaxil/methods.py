@@ -18,90 +18,17 @@ import importlib.metadata
 import importlib.util
 import pathlib
 import sys
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
-from jaxil import outside
+from jaxil import declarations, outside
+from jaxil.declarations import Field, Method
+from jaxil.declarations import (
+    Variation as Variation,  # METHOD names it methods.Variation
+)
 from jaxil.errors import Fault, UsageError, raised, unknown_name
 
 _FOLDER = pathlib.Path(__file__).parent / "rewarders"
 _ENTRY_POINTS = "jaxil.methods"
-
-
-class Field(NamedTuple):
-    """One setting.
-
-    Attributes:
-      default: the paper's value, or the reference's; its type is the field's.
-      about: what it is and what is usual, for `--help` and messages.
-      low: smallest value of a number.
-      high: largest value of a number.
-      choices: of a name; empty if any text will do.
-      positive: whether a number must lie above `low`, not at it.
-    """
-
-    default: Any
-    about: str
-    low: float | None = None
-    high: float | None = None
-    choices: tuple[str, ...] = ()
-    positive: bool = False
-
-
-class Variation(NamedTuple):
-    """A field that makes an ablation of the method.
-
-    Attributes:
-      field: dotted, such as "sinkhorn.cost".
-      plain: the value of the method itself.
-      words: what figures call another value; "{}" stands for it.
-    """
-
-    field: str
-    plain: Any
-    words: str
-
-
-class Method(NamedTuple):
-    """What the program knows of a method.
-
-    Attributes:
-      name: how configs name it; `get` sets package.module:METHOD if it is not `known`.
-      label: how figures and tables name it.
-      about: what it learns from, in a few words.
-      colour: of its curves, "#rrggbb".
-      rank: its place in tables and legends: small numbers first.
-      sections: its config sections. Their fields are keyword arguments of
-        `make_rewarder`, or of `make_update_step` where there is one.
-      make_rewarder: name of a function of its file: (AgentSpec, **fields) -> Rewarder.
-      make_update_step: name of a function of its file that replaces the learner's own
-        step: (Learner, **fields) -> UpdateStep; None for the learner's.
-      uses_demonstrations: whether it imitates anything.
-      sees_actions: whether it reads the expert's actions, or the field that decides.
-      plays: whether the agent acts in the environment; a method that does not learns
-        from demonstrations alone, and an update counts as the frames that an agent
-        would play for it.
-      total_updates: length of a run of a method that does not play.
-      needs_pixels: whether it cannot learn from state vectors.
-      metrics: columns of train.csv beside those of the learner.
-      variations: fields that make ablations.
-    """
-
-    name: str
-    label: str
-    about: str
-    colour: str = "#5b5b5b"
-    rank: int = 100
-    sections: Mapping[str, Mapping[str, Field]] = {}
-    make_rewarder: str = "make_rewarder"
-    make_update_step: str | None = None
-    uses_demonstrations: bool = True
-    sees_actions: bool | str = False
-    plays: bool = True
-    total_updates: int = 0
-    needs_pixels: bool = False
-    metrics: tuple[str, ...] = ()
-    variations: tuple[Variation, ...] = ()
 
 
 DISCRIMINATOR = {
@@ -227,10 +154,14 @@ def load(name: str, function: str) -> Any:
     """Imports a method's file and returns one of its functions.
 
     Raises:
-      UsageError: the file has no such function.
+      UsageError: the file cannot be imported, or has no such function.
     """
     path = _references().get(name, name).partition(":")[0]
-    module = importlib.import_module(path)
+    try:
+        module = importlib.import_module(path)
+    except Exception as error:  # whatever the user's file raises
+        rule = f"cannot be loaded: {raised(error)}"
+        raise UsageError(Fault("method", rule, value=name)) from error
     if not hasattr(module, function):
         rule = f"is declared without its function: {path!r} has no `{function}`"
         raise UsageError(Fault("method", rule, value=name))
@@ -291,6 +222,9 @@ def _declaration(reference: str) -> Method:
                 value=reference,
             )
         )
+    faults = [*declarations.problems(method)]
+    if faults:
+        raise UsageError([Fault("method", fault, value=reference) for fault in faults])
     return method
 
 

@@ -11,9 +11,9 @@ ROOT = pathlib.Path(__file__).parent.parent / "jaxil"
 # from itself. What is not named here is a command, on top of all.
 FLOORS = {
     "errors": -1,
-    "outside": 0,
+    **dict.fromkeys(("declarations", "outside"), 0),
     **dict.fromkeys(("methods", "maths", "machine", "files"), 1),
-    **dict.fromkeys(("native", "replay", "declarations"), 2),
+    **dict.fromkeys(("native", "replay"), 2),
     **dict.fromkeys(("networks", "environments"), 3),
     **dict.fromkeys(("learner", "demonstrations"), 4),
     "rewarders": 5,

@@ -66,6 +66,9 @@ def test_its_module_is_a_preset(write):
     name = write("named")
     config = presets.get_config("named", "METHOD:walker_walk")
     assert config == jaxil_config.default_config(name, "walker_walk")
+    assert presets.get_config("named", "METHOD") == config
+    with pytest.raises(UsageError, match="'nmed' is unknown; choose one of"):
+        presets.get_config("nmed", "gymnasium:Hopper-v5")
 
 
 def test_a_file_that_cannot_be_read_says_where(write):
@@ -77,21 +80,26 @@ def test_a_file_that_cannot_be_read_says_where(write):
 def test_all_faults_of_a_declaration_are_one_message(write):
     old = 'sections={"flat": {"weight": methods.Field(1.0, "each reward", 1.0)}},'
     new = """sections={
-        "encoder": {"weight": methods.Field(1.0, "")},
+        "other": {"weight": methods.Field(1.0, ""), "my-rate": methods.Field(1, "")},
         "flat": {"weight": methods.Field(1.0, ""), "sizes": methods.Field([8], "")},
         "bare": {"rate": 0.1},
+        "far": {"away": methods.Field(3, "", 0, 2)},
     },
-    metrics=("mean", "critic/own", "flat/mean"),"""
+    sees_actions="flat.sight",
+    metrics=("mean", "critic/own", "flat/mean", "flat/mean"),"""
     with pytest.raises(UsageError) as refused:
         jaxil_config.default_config(write("faulty", old, new), "walker_walk")
     faults = [str(fault) for fault in refused.value.faults]
     words = [
-        "section 'encoder', which every config has",
-        "'weight' in both 'encoder' and 'flat'",
+        "other.my-rate; use names as Python's variables",
+        "'weight' in both 'other' and 'flat'",
         "flat.sizes with the default [8]",
         "sections['bare']={'rate': 0.1}; give a dict of Field",
+        "far.away=3 must lie in [0, 2]",
+        "sees_actions='flat.sight', which is none of its fields",
         "metric 'mean'; write GROUP/NAME",
         "metric 'critic/own'",
+        "metric 'flat/mean' twice",
     ]
     assert len(faults) == len(words)
     for fault, word in zip(faults, words, strict=True):
@@ -99,6 +107,9 @@ def test_all_faults_of_a_declaration_are_one_message(write):
     text = write("texts", "uses_demonstrations", 'metrics=("x/y"),uses_demonstrations')
     with pytest.raises(UsageError, match="metrics='x/y'; give a tuple"):
         jaxil_config.default_config(text, "walker_walk")
+    taken = write("takes", old, 'sections={"encoder": {}, "own": {}, "seed": {}},')
+    with pytest.raises(UsageError, match=r"every config has \(encoder, seed\)"):
+        jaxil_config.default_config(taken, "walker_walk")
 
 
 def test_the_small_preset_sets_only_declared_fields(write):

@@ -8,6 +8,7 @@ import pytest
 from dm_env import specs
 
 from jaxil.environments import tasks
+from jaxil.environments.pixel_environment import PixelEnvironment
 
 _BLACK = np.zeros((8, 8, 3), np.uint8)
 
@@ -47,16 +48,16 @@ def bounded(low, high, dtype: Any = np.float64):
 @pytest.mark.parametrize(
     ("faulty", "words"),
     [
-        (lambda: Task(reward=None), "reward None; give a number, 0 if there is none"),
-        (lambda: Task(reward=np.inf), "reward inf"),
-        (lambda: Task(reward="much"), "reward 'much'"),
-        (lambda: Task(discount=None), "discount None; give a number, in [0, 1]"),
-        (lambda: Task(discount=1.5), "discount 1.5"),
+        (lambda: Task(reward=None), "reward is None; it must be a number, 0 in"),
+        (lambda: Task(reward="much"), "reward is 'much'"),
+        (lambda: Task(discount=None), "discount is None; it must lie in [0, 1]"),
+        (lambda: Task(discount=1.5), "discount is 1.5"),
         (lambda: Task(image=np.zeros((8, 8))), "it observes float64[8, 8]"),
         (lambda: Task(image=_BLACK / 2.0), "it observes float64[8, 8, 3]"),
         (lambda: Task(image={}), "it observes nothing"),
+        (lambda: Task(image={"a": [1, [2, 3]], "b": None}), "list, NoneType"),
         (lambda: Task(bounded([-1, 0], [1, np.inf])), "one limit alone"),
-        (lambda: Task(bounded([0, 0], [3, 3], np.int32)), "int32, but needs floats"),
+        (lambda: Task(bounded([-1, np.nan], [1, 1])), "NaN among the limits"),
         (lambda: Task(specs.Array((1,), np.float64)), "needs a bounded vector"),
     ],
 )
@@ -75,6 +76,40 @@ def test_actions_have_the_range_and_type_of_the_task(dtype, monkeypatch):
     environment.step(np.array([0.5, 0.5], np.float32))
     assert task.taken.dtype == dtype
     np.testing.assert_array_equal(task.taken, [3.0, 0.5])  # no limit: [-1, 1]
+
+
+def test_whole_numbers_are_rounded_to(monkeypatch):
+    task = Task(bounded([0, 0], [4, 4], np.int32))
+    monkeypatch.setitem(globals(), "whole", lambda: task)
+    environment = tasks.make_environment(f"{__name__}:whole", seed=0)
+    environment.reset()
+    environment.step(np.array([0.4, 0.2], np.float32))
+    assert task.taken.dtype == np.int32
+    np.testing.assert_array_equal(task.taken, [3, 2])
+
+
+def test_a_reward_that_is_not_finite_does_not_end_a_run():
+    """The agent never reads it; only the tables show it."""
+    task = Task(reward=np.nan)
+    environment = PixelEnvironment(
+        task,
+        seed=0,
+        action_repeat=1,
+        image_size=8,
+        frame_stack=1,
+        observation="pixels",
+    )
+    environment.reset()
+    assert np.isnan(environment.step(np.zeros(1)).reward)
+
+
+def test_an_error_of_the_task_says_where_it_is(monkeypatch):
+    def failing():
+        raise ValueError("no light")
+
+    monkeypatch.setitem(globals(), "failing", failing)
+    (fault,) = tasks.problems(f"{__name__}:failing", **settings())
+    assert "ValueError: no light (test_own_task_faults.py, line " in str(fault)
 
 
 def settings():

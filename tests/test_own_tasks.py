@@ -182,7 +182,7 @@ def test_a_square_image_is_recorded_as_the_task_draws_it(tmp_path):
     [
         ("light:make", "light:far", "returned [5.] at step 0, not in [-1, 1]"),
         ("light:make", "light:lost", "returned [nan] at step 0, not in [-1, 1]"),
-        ("light:Unrewarded", "light:centre", "its step has reward nan; give a number"),
+        ("light:Unrewarded", "light:centre", "reward is nan after step 0"),
     ],
 )
 def test_what_no_run_could_read_is_not_recorded(task, policy, message, tmp_path):

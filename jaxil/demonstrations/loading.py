@@ -60,8 +60,8 @@ class Wanted(NamedTuple):
       fit: one of `frames.FITS`: how frames of other shapes become squares.
       dataset_camera: of a dataset with several.
       stated_action_repeat: of a file of pixels that does not say it; 0 if unknown.
-      takes_fewer: whether fewer episodes will do, as they do by default unless
-        `num_episodes` is given.
+      takes_fewer: whether fewer episodes will do; the functions here set it where they
+        are not given `num_episodes`.
       max_bytes: memory limit for a file of pixels.
     """
 

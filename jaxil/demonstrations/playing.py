@@ -1,5 +1,6 @@
 """Records episodes as simulator states, or as pixels where a task has none."""
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -55,6 +56,11 @@ def _played(
             action = decide(len(actions), timestep.observation)
             actions.append(np.asarray(action, np.float32))
             timestep = environment.step(actions[-1])
+            if not math.isfinite(timestep.reward):
+                raise ValueError(
+                    f"the task's reward is {timestep.reward} after step {len(rewards)} "
+                    f"of episode {episode}"
+                )
             rewards.append(timestep.reward)
             seen.append(look())
         finished(episode, sum(rewards))

@@ -1,6 +1,6 @@
 """The fields `demonstrations.*` of a config."""
 
-from jaxil.methods import Field
+from jaxil.declarations import Field
 
 DEMONSTRATIONS: dict[str, Field] = {
     "source": Field("", "a file or folder; empty: the shipped file"),

@@ -118,13 +118,15 @@ class PixelEnvironment(dm_env.Environment):
             raise ValueError(f"action has shape {action.shape}, expected {expected}.")
         half_range = (self._action_high - self._action_low) / 2.0
         control = self._action_low + (action + 1.0) * half_range
+        if np.issubdtype(self._action_dtype, np.integer):
+            control = np.round(control)
         control = control.astype(self._action_dtype)
         reward, discount, is_last = 0.0, 1.0, False
         for _ in range(self._action_repeat):
             inner = self._simulator.step(control)
             self._seen = inner.observation
-            reward += _number("reward", inner.reward, -math.inf, math.inf)
-            discount *= _number("discount", inner.discount, 0.0, 1.0)
+            reward += _reward(inner.reward)
+            discount *= _discount(inner.discount)
             self._frames_played += 1
             is_last = inner.last() or self._frames_played >= self._frame_limit
             if is_last:
@@ -246,38 +248,56 @@ def _action_range(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
     """Returns the smallest and largest actions; -1 and 1 where there are no limits."""
     if not isinstance(bounds, specs.BoundedArray) or len(bounds.shape) != 1:
         raise ValueError(f"has actions {bounds}, but needs a bounded vector")
-    if not np.issubdtype(bounds.dtype, np.floating):
-        raise ValueError(f"has actions of {bounds.dtype}, but needs floats")
     low, high = (
         np.broadcast_to(x, bounds.shape).astype(np.float64)
         for x in (bounds.minimum, bounds.maximum)
     )
+    if np.isnan(low).any() or np.isnan(high).any():
+        raise ValueError(f"has NaN among the limits of its actions: {bounds}")
     below, above = np.abs(low) < _UNBOUNDED, np.abs(high) < _UNBOUNDED
     if np.any(below != above):
         raise ValueError(f"has actions with one limit alone: {bounds}; give both")
     return np.where(below, low, -1.0), np.where(below, high, 1.0)
 
 
-def _number(name: str, value: Any, low: float, high: float) -> float:
-    """Returns what a task's step gave as a float, if it is one in the range.
+def _reward(value: Any) -> float:
+    """Returns a task's reward; NaN and infinities are left to what reads it.
 
     Raises:
-      ValueError: it is not, which dm_env allows for a reset alone.
+      ValueError: it is no number; dm_env has None at a reset alone.
+    """
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        rule = "must be a number, 0 in a task without rewards"
+        raise ValueError(f"a step's reward is {value!r}; it {rule}") from None
+
+
+def _discount(value: Any) -> float:
+    """Returns a task's discount.
+
+    Raises:
+      ValueError: it is no number in [0, 1]; dm_env has None at a reset alone.
     """
     try:
         number = float(value)
     except (TypeError, ValueError):
         number = math.nan
-    if not (math.isfinite(number) and low <= number <= high):
-        expected = "0 if there is none" if math.isinf(high) else "in [0, 1]"
-        raise ValueError(f"its step has {name} {value!r}; give a number, {expected}")
+    if not 0.0 <= number <= 1.0:
+        rule = "must lie in [0, 1], with 0 at a true end"
+        raise ValueError(f"a step's discount is {value!r}; it {rule}")
     return number
 
 
 def _described(observation: Any) -> str:
     """Returns types and shapes, for messages."""
-    parts = [np.asarray(part) for part in _parts(observation)]
-    return ", ".join(f"{part.dtype}{list(part.shape)}" for part in parts) or "nothing"
+    shown = [
+        f"{part.dtype}{list(part.shape)}"
+        if isinstance(part, np.ndarray)
+        else type(part).__name__
+        for part in _parts(observation)
+    ]
+    return ", ".join(shown) or "nothing"
 
 
 def _parts(observation: Any) -> list[Any]:

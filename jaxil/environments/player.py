@@ -132,7 +132,7 @@ class Player:
                     self._step(index, action)
                     self._receive(index)
                     self._forget_ended(index)
-        if begun and not self._open:  # all were lost
+        if begun and not self._open:  # all are to begin anew
             return self.begin(wanted)
         return bool(begun)
 

@@ -20,7 +20,7 @@ from dm_env import specs
 from jaxil import outside
 from jaxil.environments import suite
 from jaxil.environments.pixel_environment import PixelEnvironment
-from jaxil.errors import Fault, UsageError
+from jaxil.errors import Fault, UsageError, raised
 
 _GYMNASIUM = "gymnasium:"
 _RECORDED_SIZE, _LARGEST_RECORDED = 84, 160  # larger images would fill the memory
@@ -64,8 +64,7 @@ def problems(task: str, **settings: Any) -> list[Fault]:
     except UsageError as error:
         return [f if isinstance(f, Fault) else Fault("task", f) for f in error.faults]
     except Exception as error:  # whatever the user's task raises
-        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-        return [Fault("task", f"cannot be used: {kind}{error}", value=task)]
+        return [Fault("task", f"cannot be used: {raised(error)}", value=task)]
     return []
 
 

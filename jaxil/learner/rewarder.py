@@ -125,9 +125,9 @@ class Rewarder(NamedTuple):
         not, `expert_episodes` is None.
       samples_successors: whether samples of agent and expert include the observation
         one step later.
-      rewards_transitions: whether each reward depends on its own transition, and the
-        frames stacked in it, alone. If so, `rewards` may get a shorter episode padded
-        with its last frame and action, and is compiled for fewer lengths.
+      ignores_later_frames: whether reward t depends on frames up to t + 1 alone, and
+        not on how long the episode is. If so, `rewards` gets shorter episodes with
+        their last frame and action repeated, and is compiled for fewer lengths.
       relabel: (state, learner, batch) -> rewards [B, n], for methods that reward each
         batch by the current state; `batch` has its window. None where rewards are
         stored.
@@ -156,7 +156,7 @@ class Rewarder(NamedTuple):
     expert_batch_size: int = 0
     matches_episodes: bool = False
     samples_successors: bool = False
-    rewards_transitions: bool = False
+    ignores_later_frames: bool = False
     relabel: Callable[[RewarderState, LearnerParams, Batch], Array] | None = None
     rewards_changed: Callable[[RewarderState], Array | bool] | None = None
     actor_loss: (

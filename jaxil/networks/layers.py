@@ -18,10 +18,10 @@ _LAYER_NORM_EPSILON = 1e-5  # PyTorch's default; flax's own is 1e-6
 def orthogonal(scale: float = 1.0) -> nn.initializers.Initializer:
     """Returns flax's orthogonal initialiser, which draws one matrix after another.
 
-    Under `vmap` flax's would factorise a batch of matrices, for which jaxlib blocks a
-    thread of XLA's pool until other threads of it have done their share: on two cores
-    two such batches waited for each other for ever (jaxlib 0.10.2, two inverse models
-    of width 1024).
+    Under `vmap` flax's would factorise a batch of matrices. For that a thread of XLA's
+    pool hands matrices to the pool's other threads and blocks until they are done: on
+    two cores two such batches waited for each other for ever (jaxlib 0.10.2, three
+    inverse models of width 1024).
     """
     initialise = nn.initializers.orthogonal(scale)
 

@@ -5,7 +5,7 @@
 `configs/` hold the same presets as files.
 """
 
-import importlib
+import importlib.util
 import pkgutil
 
 from jaxil import config as jaxil_config
@@ -27,8 +27,8 @@ def get_config(name: str, argument: str | None = None) -> Config:
 
     Args:
       name: one of `names()`, or the module of a method of one's own.
-      argument: METHOD,TASK of `tiny`, METHOD:TASK of a module, TASK of the others; None
-        for the preset's own default.
+      argument: METHOD,TASK of `tiny`, METHOD or METHOD:TASK of a module, TASK of the
+        others; None for the preset's own default.
 
     Raises:
       UsageError: there is no such preset, or the argument is wrong.
@@ -38,7 +38,14 @@ def get_config(name: str, argument: str | None = None) -> Config:
         return module.get_config(*([] if argument is None else [argument]))
     if name in methods.known():
         return jaxil_config.default_config(name, argument or _DEFAULT_TASK)
-    method, colon, task = (argument or "").partition(":")
-    if colon:
-        return jaxil_config.default_config(f"{name}:{method}", task)
+    if argument and _is_module(name):
+        method, _, task = argument.partition(":")
+        return jaxil_config.default_config(f"{name}:{method}", task or _DEFAULT_TASK)
     raise UsageError(unknown_name("--config", name, names()))
+
+
+def _is_module(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except (Exception, SystemExit):  # it imports the packages around the module
+        return False

@@ -3,14 +3,14 @@
 import functools
 from collections.abc import Sequence
 
-from jaxil.reporting import measures, plots
+from jaxil.reporting import figures, measures, plots
 from jaxil.reporting.groups import Group, expert_returns, tasks_of
 from jaxil.reporting.measures import Curve, Final
 from jaxil.reporting.sheets import Panel, Sheet
 
 _RETURN = "task_return_mean"
 _LOGITS = ("discriminator/expert_logit", "discriminator/agent_logit")
-_NOT_OF_METHODS = ("critic/", "actor/", "batch/", "replay/", *_LOGITS)
+_MOST_METRICS = 24  # panels in one figure; more would take long and be too small
 
 
 def curve_sheet(
@@ -100,11 +100,11 @@ def metric_sheet(groups: Sequence[Group], *, name: str) -> Sheet | None:
     """Plots what the methods log of themselves over frames; None without any."""
     panels, found = [], []
     for task, task_groups in tasks_of(groups).items():
-        tables = [run.training for group in task_groups for run in group.runs]
-        columns = dict.fromkeys(column for table in tables for column in table)
+        declared = (figures.declaration(g.variant.method) for g in task_groups)
+        columns = dict.fromkeys(column for d in declared for column in d.metrics)
         for column in columns:
-            if "/" not in column or column.startswith(_NOT_OF_METHODS):
-                continue
+            if column in _LOGITS:
+                continue  # they have a figure of their own
             lines = [
                 measures.curve(group, "frame", column, table="training")
                 for group in task_groups
@@ -117,7 +117,9 @@ def metric_sheet(groups: Sequence[Group], *, name: str) -> Sheet | None:
                 )
                 panels.append(Panel(f"{task}: {column}", draw))
     caption = "The methods' own columns of train.csv, mean over seeds and its interval."
-    return _sheet(name, panels, found, caption)
+    if len(panels) > _MOST_METRICS:
+        caption += f" The first {_MOST_METRICS} of {len(panels)}."
+    return _sheet(name, panels[:_MOST_METRICS], found, caption)
 
 
 def _sheet(

@@ -133,6 +133,6 @@ def make_rewarder(
         init,
         update,
         expert_batch_size=batch_size,
-        rewards_transitions=True,
+        ignores_later_frames=True,
         relabel=relabel,
     )

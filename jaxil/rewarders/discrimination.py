@@ -206,7 +206,7 @@ def make_transition_rewarder(
         update,
         expert_batch_size=batch_size,
         samples_successors=True,
-        rewards_transitions=True,
+        ignores_later_frames=True,
         relabel=relabel if relabels else None,
         rewards_changed=None if relabels else lambda state: True,
     )

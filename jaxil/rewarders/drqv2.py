@@ -30,4 +30,4 @@ def make_rewarder(agent: AgentSpec) -> Rewarder:
         del state, learner, expert_episodes
         return episode.rewards
 
-    return Rewarder(rewards, rewards_transitions=True)
+    return Rewarder(rewards, ignores_later_frames=True)

@@ -183,6 +183,6 @@ def make_rewarder(
         observe,
         expert_batch_size=batch_size,
         matches_episodes=bool(num_components),
-        rewards_transitions=True,
+        ignores_later_frames=True,
         rewards_changed=lambda state: True,
     )

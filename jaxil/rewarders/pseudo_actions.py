@@ -233,7 +233,7 @@ def with_cloning(
         expert_batch_size=expert_batch_size,
         matches_episodes=rewarder.matches_episodes,
         samples_successors=True,
-        rewards_transitions=rewarder.rewards_transitions,
+        ignores_later_frames=rewarder.ignores_later_frames,
         relabel=of_inner(rewarder.relabel),
         rewards_changed=of_inner(rewarder.rewards_changed),
         actor_loss=actor_loss,

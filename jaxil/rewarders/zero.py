@@ -21,7 +21,7 @@ METHOD = methods.Method(
 def make_rewarder(agent: AgentSpec) -> Rewarder:
     """Returns a rewarder of zeros."""
     del agent
-    return Rewarder(zero_rewards, rewards_transitions=True)
+    return Rewarder(zero_rewards, ignores_later_frames=True)
 
 
 def zero_rewards(

@@ -46,7 +46,8 @@ class Agent(NamedTuple):
       sample_action: see `policy.make_sample_action`.
       mean_action: see `policy.make_mean_action`.
       observe: the rewarder's.
-      rewards: the rewarder's.
+      rewards: (rewarder state, learner, episode, expert episodes) -> the rewarder's
+        rewards, a NumPy array [T].
       compiled_length: (T) -> the length for which `rewards` and `refresh` of an episode
         of T steps are compiled.
       refresh: rewards of stored episodes as of now, see `rewarder.make_refresh`.
@@ -161,11 +162,11 @@ def mean_image(
     if not config.encoder.subtract_mean_image or demonstrations is None:
         return 0.5
     total = np.zeros(demonstrations.frames.shape[2:], np.float64)
-    lengths = demonstrations.num_frames
+    num_frames = demonstrations.num_frames
     # One episode at a time bounds the memory.
-    for episode, length in zip(demonstrations.frames, lengths, strict=True):
+    for episode, length in zip(demonstrations.frames, num_frames, strict=True):
         total += episode[:length].sum(axis=0, dtype=np.float64)
-    mean = (total / lengths.sum() / 255.0).astype(np.float32)
+    mean = (total / num_frames.sum() / 255.0).astype(np.float32)
     return np.concatenate([mean] * config.frame_stack, axis=-1)
 
 
@@ -214,7 +215,7 @@ def make_agent(
 
     Args:
       config: checked.
-      environment: read for its specs only.
+      environment: read for its specs and its episodes' length only.
       demonstrations: what the method imitates, or None.
     """
     action_dim = environment.action_spec().shape[0]
@@ -251,10 +252,12 @@ def make_agent(
         step = make_averaging_step(step, tau=config.policy_tau)
     step = make_gathering_step(step)
 
+    usual_steps = environment.episode_steps
+
     def compiled_length(num_steps: int) -> int:
-        if not rewarder.rewards_transitions:
+        if not rewarder.ignores_later_frames:
             return num_steps
-        return lengths.padded_length(num_steps, environment.episode_steps)
+        return lengths.padded_length(num_steps, usual_steps)
 
     compiled_rewards = jax.jit(rewarder.rewards)
 

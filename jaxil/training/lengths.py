@@ -18,7 +18,7 @@ def padded_length(num_steps: int, longest: int) -> int:
 
     Args:
       num_steps: T of the episode, >= 1.
-      longest: an episode of a usual length, which is not padded; nor are longer ones.
+      longest: steps of a whole episode. That length is not padded, nor are longer ones.
     """
     if num_steps >= longest:
         return num_steps

@@ -116,9 +116,9 @@ class Updates:
         for length, indices in by_length.items():
             for first in range(0, len(indices), _REFRESH_EPISODES):
                 chunk = indices[first : first + _REFRESH_EPISODES]
-                # Always of one size, so that each episode length compiles once.
-                padded = chunk + chunk[-1:] * (_REFRESH_EPISODES - len(chunk))
-                rewards = self._refreshed(state, padded, length)[: len(chunk)]
+                # Always of one size, so that each length compiles once.
+                filled = chunk + chunk[-1:] * (_REFRESH_EPISODES - len(chunk))
+                rewards = self._refreshed(state, filled, length)[: len(chunk)]
                 for index, new in zip(chunk, rewards, strict=True):
                     replay.replace_rewards(index, new[: len(replay.slots(index)) - 1])
 
