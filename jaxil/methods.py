@@ -22,14 +22,11 @@ from typing import Any
 
 from jaxil import declarations, outside
 from jaxil.declarations import Field, Method
-from jaxil.declarations import (
-    Variation as Variation,  # METHOD names it methods.Variation
-)
+from jaxil.declarations import Variation as Variation  # METHODs use it from here
 from jaxil.errors import Fault, UsageError, raised, unknown_name
 
 _FOLDER = pathlib.Path(__file__).parent / "rewarders"
 _ENTRY_POINTS = "jaxil.methods"
-
 
 DISCRIMINATOR = {
     "hidden_dim": Field(1024, "width of its hidden layers; 1024 in ROT", 1, 10**5),
