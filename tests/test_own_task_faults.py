@@ -78,6 +78,16 @@ def test_actions_have_the_range_and_type_of_the_task(dtype, monkeypatch):
     np.testing.assert_array_equal(task.taken, [3.0, 0.5])  # no limit: [-1, 1]
 
 
+@pytest.mark.parametrize("name", ["step_limit", "frame_seconds"])
+@pytest.mark.parametrize("value", [lambda: 10, "10", -1])
+def test_numbers_that_a_task_offers_are_numbers(name, value, monkeypatch):
+    task = Task()
+    setattr(task, name, value)
+    monkeypatch.setitem(globals(), "offering", lambda: task)
+    with pytest.raises(ValueError, match=f"has {name}=.*number above 0"):
+        _ = tasks.make_environment(f"{__name__}:offering", seed=0).step_seconds
+
+
 def test_whole_numbers_are_rounded_to(monkeypatch):
     task = Task(bounded([0, 0], [4, 4], np.int32))
     monkeypatch.setitem(globals(), "whole", lambda: task)

@@ -1,6 +1,7 @@
 """A task as the agent sees it: agent steps, stacked images or states."""
 
 import math
+import numbers
 from collections.abc import Mapping
 from typing import Any
 
@@ -187,7 +188,7 @@ class PixelEnvironment(dm_env.Environment):
     @property
     def step_limit(self) -> float | None:
         """Frames of a whole episode; None or infinity without a time limit."""
-        return getattr(self._simulator, "step_limit", None)
+        return self._own_number("step_limit")
 
     @property
     def episode_steps(self) -> int:
@@ -197,12 +198,19 @@ class PixelEnvironment(dm_env.Environment):
     @property
     def step_seconds(self) -> float | None:
         """Simulated duration of an agent step; None if unknown."""
-        seconds = getattr(self._simulator, "frame_seconds", None)
+        seconds = self._own_number("frame_seconds")
         return None if seconds is None else seconds * self._action_repeat
 
     def close(self) -> None:
         """Frees the simulation."""
         self._simulator.close()
+
+    def _own_number(self, name: str) -> float | None:
+        """Returns a number that the task may offer, None without it."""
+        number = getattr(self._simulator, name, None)
+        if number is None or (isinstance(number, numbers.Real) and float(number) > 0):
+            return number
+        raise ValueError(f"has {name}={number!r}; make it a number above 0, or None")
 
     def _restart(self, seeds: np.ndarray) -> dm_env.TimeStep:
         """Starts the episode that `seeds`, uint32 [8], determine."""
