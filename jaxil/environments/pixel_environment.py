@@ -207,8 +207,8 @@ class PixelEnvironment(dm_env.Environment):
 
     def _own_number(self, name: str) -> float | None:
         """Returns a number that the task may offer, None without it."""
-        number = getattr(self._simulator, name, None)
-        if number is None or (isinstance(number, numbers.Real) and float(number) > 0):
+        number: Any = getattr(self._simulator, name, None)
+        if number is None or (isinstance(number, numbers.Real) and number > 0):
             return number
         raise ValueError(f"has {name}={number!r}; make it a number above 0, or None")
 

@@ -218,10 +218,8 @@ class _Gymnasium(dm_env.Environment):
         self._space = space
         spec, inner = self._inner.spec, self._inner.unwrapped
         self.step_limit = spec and spec.max_episode_steps
-        rate = inner.metadata.get("render_fps")
-        self.frame_seconds = getattr(inner, "dt", None) or (
-            1.0 / rate if rate else None
-        )
+        rate = inner.metadata.get("render_fps") or None
+        self.frame_seconds = getattr(inner, "dt", None) or (rate and 1.0 / rate)
         self._next_seed: int | None = None
         self._is_rendered = False
 
