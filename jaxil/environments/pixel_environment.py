@@ -207,10 +207,11 @@ class PixelEnvironment(dm_env.Environment):
 
     def _own_number(self, name: str) -> float | None:
         """Returns a number that the task may offer, None without it."""
-        number: Any = getattr(self._simulator, name, None)
-        if number is None or (isinstance(number, numbers.Real) and number > 0):
-            return number
-        raise ValueError(f"has {name}={number!r}; make it a number above 0, or None")
+        found = getattr(self._simulator, name, None)
+        number = float(found) if isinstance(found, numbers.Real) else 0.0
+        if found is None or number > 0.0:
+            return found
+        raise ValueError(f"has {name}={found!r}; make it a number above 0, or None")
 
     def _restart(self, seeds: np.ndarray) -> dm_env.TimeStep:
         """Starts the episode that `seeds`, uint32 [8], determine."""
