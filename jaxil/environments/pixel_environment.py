@@ -205,7 +205,7 @@ class PixelEnvironment(dm_env.Environment):
         """Frees the simulation."""
         self._simulator.close()
 
-    def _own_number(self, name: str) -> float | None:
+    def _own_number(self, name: str) -> Any:
         """Returns a number that the task may offer, None without it."""
         found = getattr(self._simulator, name, None)
         number = float(found) if isinstance(found, numbers.Real) else 0.0
