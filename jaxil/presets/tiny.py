@@ -25,7 +25,7 @@ shadows. Other deviations from the paper:
   of each frame instead of the critic's features, which mislead it: `walker_stand` and
   `finger_spin` are learned from components and not from features. On
   `ball_in_cup_catch` it is the other way round: components lose a small ball
-  (launch/results/README.md, "Learning: the ladder"). On walker_run, where only 12k
+  (launch/results/README.md, "Learning: the ladder"). On walker_run, where only 35k
   frames were tried, components are assumed. P-SIL compares them on finger_spin and
   walker_walk; on `walker_stand` they mislead it too.
 - On ball_in_cup_catch P-DAC updates four times after each step. Its three seeds reached
