@@ -91,6 +91,9 @@ class Method(NamedTuple):
 
 def problems(method: Method) -> Iterator[str]:
     """Yields each rule that sections, fields or metrics break."""
+    if not isinstance(method.sections, Mapping):
+        yield f"has sections={method.sections!r}; give a dict of dicts of Field"
+        return
     yield from _section_problems(method.sections)
     own = {
         f"{section}.{name}"
@@ -140,6 +143,11 @@ def _section_problems(sections: Any) -> Iterator[str]:
                     f"has {section}.{name} with the default {field.default!r}; give "
                     "True or False, a number, text or a tuple"
                 )
+                continue
+            if (field.low, field.high) != (None, None) and (
+                type(field.default) not in (int, float)
+            ):
+                yield f"has {section}.{name} with a range, which only numbers have"
                 continue
             for fault in field_problems(f"{section}.{name}", field, field.default):
                 yield f"has a default that its own rule forbids: {fault}"

@@ -83,7 +83,7 @@ def test_all_faults_of_a_declaration_are_one_message(write):
         "other": {"weight": methods.Field(1.0, ""), "my-rate": methods.Field(1, "")},
         "flat": {"weight": methods.Field(1.0, ""), "sizes": methods.Field([8], "")},
         "bare": {"rate": 0.1},
-        "far": {"away": methods.Field(3, "", 0, 2)},
+        "far": {"away": methods.Field(3, "", 0, 2), "name": methods.Field("", "", 0)},
     },
     sees_actions="flat.sight",
     metrics=("mean", "critic/own", "flat/mean", "flat/mean"),"""
@@ -96,6 +96,7 @@ def test_all_faults_of_a_declaration_are_one_message(write):
         "flat.sizes with the default [8]",
         "sections['bare']={'rate': 0.1}; give a dict of Field",
         "far.away=3 must lie in [0, 2]",
+        "far.name with a range, which only numbers have",
         "sees_actions='flat.sight', which is none of its fields",
         "metric 'mean'; write GROUP/NAME",
         "metric 'critic/own'",
@@ -107,6 +108,9 @@ def test_all_faults_of_a_declaration_are_one_message(write):
     text = write("texts", "uses_demonstrations", 'metrics=("x/y"),uses_demonstrations')
     with pytest.raises(UsageError, match="metrics='x/y'; give a tuple"):
         jaxil_config.default_config(text, "walker_walk")
+    none = write("none", old, "sections=None,")
+    with pytest.raises(UsageError, match="sections=None; give a dict of dicts"):
+        jaxil_config.default_config(none, "walker_walk")
     taken = write("takes", old, 'sections={"encoder": {}, "own": {}, "seed": {}},')
     with pytest.raises(UsageError, match=r"every config has \(encoder, seed\)"):
         jaxil_config.default_config(taken, "walker_walk")
