@@ -9,7 +9,7 @@ from jaxil.errors import Fault, unknown_name
 # The types of fields that --config.FIELD=TEXT can be read as.
 _TYPES = (bool, int, float, str, tuple)
 # Columns of train.csv that the learner writes begin so, or contain no slash.
-LEARNERS_GROUPS = ("critic/", "actor/", "batch/", "replay/")
+_LEARNER_GROUPS = ("critic/", "actor/", "batch/", "replay/")
 
 
 class Field(NamedTuple):
@@ -161,8 +161,8 @@ def _metric_problems(names: Any) -> Iterator[str]:
     for name in dict.fromkeys(names):
         if names.count(name) > 1:
             yield f"has the metric {name!r} twice"
-        if "/" not in name or name.startswith(LEARNERS_GROUPS):
+        if "/" not in name or name.startswith(_LEARNER_GROUPS):
             yield (
                 f"has a metric {name!r}; write GROUP/NAME, with a group other than the "
-                f"learner's ({', '.join(each[:-1] for each in LEARNERS_GROUPS)})"
+                f"learner's ({', '.join(each[:-1] for each in _LEARNER_GROUPS)})"
             )
