@@ -1,6 +1,5 @@
 """Discriminators between expert and agent: on features, or on pixels."""
 
-import math
 from typing import Any
 
 import chex
@@ -8,7 +7,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jax import Array
 
-from jaxil.networks.layers import MLP, Trunk, orthogonal
+from jaxil.networks.layers import MLP, Convolution, Trunk
 
 
 class Discriminator(nn.Module):
@@ -75,11 +74,13 @@ class PatchDiscriminator(nn.Module):
 
     Attributes:
       width: channels of the first layer; 32 in PatchAIL.
+      by_windows: see `Convolution`.
 
     Source: sail-sg/PatchAIL, agent/discriminator.py.
     """
 
     width: int
+    by_windows: bool = False
 
     @nn.compact
     def __call__(self, pixels: Array) -> Array:
@@ -89,6 +90,13 @@ class PatchDiscriminator(nn.Module):
         layers = (self.width, 2), (2 * self.width, 1), (4 * self.width, 1), (1, 1)
         for number, (features, stride) in enumerate(layers):
             x = nn.leaky_relu(x, 0.2) if number else x
-            initial = orthogonal(math.sqrt(2.0))
-            x = nn.Conv(features, (4, 4), stride, padding=1, kernel_init=initial)(x)
+            layer = Convolution(
+                features,
+                kernel_size=4,
+                stride=stride,
+                padding=1,
+                by_windows=self.by_windows,
+                name=f"Conv_{number}",
+            )
+            x = layer(x)
         return x.reshape(len(x), -1)

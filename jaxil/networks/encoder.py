@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxil.native import encoding
-from jaxil.networks.layers import ConvolutionReLU, dense
+from jaxil.networks.layers import Convolution, dense
 
 
 class PixelEncoder(nn.Module):
@@ -24,6 +24,7 @@ class PixelEncoder(nn.Module):
       dtype: of the convolutions; parameters are always float32.
       native: whether `encoding.encode` is used for uint8 pixels. It supports float32,
         channels in multiples of 32, and first derivatives.
+      by_windows: see `Convolution`; without effect where `native` has one.
 
     Source: facebookresearch/drqv2, drqv2.py, `Encoder`.
     """
@@ -35,6 +36,7 @@ class PixelEncoder(nn.Module):
     mean: Any = 0.5
     dtype: Any = jnp.float32
     native: bool = False
+    by_windows: bool = False
 
     @nn.compact
     def __call__(self, observation: Array) -> Array:
@@ -43,7 +45,9 @@ class PixelEncoder(nn.Module):
         mean = jnp.asarray(self.mean, jnp.float32)
         settings = zip(self.channels, self.kernel_sizes, self.strides, strict=True)
         layers = [
-            ConvolutionReLU(*each, self.dtype, name=f"Conv_{k}")
+            Convolution(
+                *each, dtype=self.dtype, by_windows=self.by_windows, name=f"Conv_{k}"
+            )
             for k, each in enumerate(settings)
         ]
         if self.native and observation.dtype == jnp.uint8:
@@ -60,7 +64,7 @@ class PixelEncoder(nn.Module):
             x = observation.astype(jnp.float32) / 255.0
             x = self.contrast * (x - (mean[None] if mean.ndim else mean))
             for layer in layers:
-                x = layer(x)
+                x = nn.relu(layer(x))
         return x.reshape(x.shape[0], -1)
 
 

@@ -48,11 +48,16 @@ def dense(features: int, name: str | None = None, dtype: Any = jnp.float32) -> n
     )
 
 
-class ConvolutionReLU(nn.Module):
-    """A VALID convolution with ReLU and a square kernel.
+class Convolution(nn.Module):
+    """A convolution with a square kernel and bias, to be followed by a ReLU.
 
-    Initial weights are orthogonal with the gain of ReLU, biases zero. `dtype` is that
-    of the convolution; parameters are always float32.
+    Initial weights are orthogonal with the gain of ReLU, biases zero.
+
+    Attributes:
+      features, kernel_size, stride: of the kernel.
+      padding: zeros on each side of the images.
+      dtype: of the convolution; parameters are always float32.
+      by_windows: whether `convolution.convolve_by_windows` is used, for penalties.
 
     Source: facebookresearch/drqv2, utils.py, `weight_init`.
     """
@@ -60,7 +65,9 @@ class ConvolutionReLU(nn.Module):
     features: int
     kernel_size: int
     stride: int
+    padding: int = 0
     dtype: Any = jnp.float32
+    by_windows: bool = False
 
     @nn.compact
     def weights(self, channels: int) -> Weights:
@@ -75,7 +82,14 @@ class ConvolutionReLU(nn.Module):
         chex.assert_rank(images, 4)
         arrays = (images, *self.weights(images.shape[-1]))
         images, kernel, bias = (x.astype(self.dtype) for x in arrays)
-        return convolution.convolve_relu(images, kernel, bias, self.stride)
+        sides = [(0, 0), *[(self.padding, self.padding)] * 2, (0, 0)]
+        convolve = convolution.convolve
+        if self.by_windows:
+            convolve = convolution.convolve_by_windows
+        return (
+            convolve(jnp.pad(images, sides), kernel, self.stride)
+            + bias[None, None, None]
+        )
 
 
 class Trunk(nn.Module):

@@ -21,8 +21,7 @@ from jaxil.maths.types import (
 from jaxil.networks.agent import apply
 from jaxil.networks.discriminator import PixelDiscriminator
 from jaxil.rewarders.discrimination import (
-    scaled,
-    separate_encoder,
+    twice_differentiable,
     unscaled,
     update_discriminator,
 )
@@ -67,14 +66,17 @@ def make_rewarder(
     Source: Kostrikov et al. 2019, arXiv:1809.02925, on pixels as in Cohen et al. 2021,
     sec. 4.1.
     """
-    discriminator = PixelDiscriminator(
-        separate_encoder(agent), agent.feature_dim, hidden_dim
-    )
+    encoder = agent.networks.encoder
+    discriminator = PixelDiscriminator(encoder, agent.feature_dim, hidden_dim)
+    smooth = discriminator.clone(encoder=twice_differentiable(encoder))
     optimiser = optax.adam(learning_rate)
 
     def logits(params: Params, x: Inputs) -> Array:
+        return apply(discriminator, params, *x)
+
+    def penalised(params: Params, x: Inputs) -> Array:
         observation, action = x
-        return apply(discriminator, params, unscaled(observation), action)
+        return apply(smooth, params, unscaled(observation), action)
 
     def init(key: Array, spec: Spec, learner: LearnerParams) -> ModuleState:
         del learner
@@ -95,11 +97,12 @@ def make_rewarder(
         return update_discriminator(
             state,
             logits,
-            (scaled(expert.observation), expert.action),
-            (scaled(view.unshifted[:batch_size]), view.action[:batch_size]),
+            (expert.observation, expert.action),
+            (view.unshifted[:batch_size], view.action[:batch_size]),
             key,
             penalty_weight=gradient_penalty,
             optimiser=optimiser,
+            penalised=penalised,
         )
 
     def relabel(state: ModuleState, learner: LearnerParams, batch: Batch) -> Array:
@@ -111,7 +114,7 @@ def make_rewarder(
             lambda x: jnp.reshape(x, (-1, *x.shape[2:])),
             (window.observation, window.action),
         )
-        flat = logits(state.params, (scaled(observation), action))
+        flat = logits(state.params, (observation, action))
         return flat.reshape(window.action.shape[:2])
 
     def rewards(
@@ -125,8 +128,7 @@ def make_rewarder(
         observations = stacking.stack_frames(
             episode.frames, frame_stack=agent.frame_stack
         )
-        x = scaled(observations[:-1]), jnp.asarray(episode.actions)
-        return logits(state.params, x)
+        return logits(state.params, (observations[:-1], jnp.asarray(episode.actions)))
 
     return Rewarder(
         rewards,

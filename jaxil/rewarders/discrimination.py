@@ -43,6 +43,7 @@ def update_discriminator(
     *,
     penalty_weight: float,
     optimiser: optax.GradientTransformation,
+    penalised: Logits | None = None,
 ) -> tuple[Module, Metrics]:
     """Takes one step towards telling expert (label 1) from agent (label 0).
 
@@ -54,15 +55,19 @@ def update_discriminator(
     Args:
       state: the discriminator.
       logits: maps parameters and inputs to logits.
-      expert: inputs of demonstrations, a pytree of float arrays [B, ...].
+      expert: inputs of demonstrations, a pytree of arrays [B, ...]: pixels in
+        [0, 255], vectors.
       agent: the same of the agent. No gradient flows into either.
       key: consumed.
       penalty_weight: weight of `losses.gradient_penalty`; 10 in the paper.
       optimiser: of the discriminator.
+      penalised: maps parameters and inputs with pixels in [0, 1] to the same logits,
+        by operations that may be differentiated twice; `logits` if no input is pixels.
 
     Source: Cohen et al. 2021, eq. (7).
     """
     expert, agent = jax.lax.stop_gradient((expert, agent))
+    smooth = penalised or logits
 
     def loss(params: Params) -> tuple[Array, Metrics]:
         together = jax.tree.map(lambda *x: jnp.concatenate(x), expert, agent)
@@ -71,7 +76,10 @@ def update_discriminator(
             expert_logits.ravel(), agent_logits.ravel()
         )
         penalty = losses.gradient_penalty(
-            lambda x: mean_logit(logits(params, x)), expert, agent, key
+            lambda x: mean_logit(smooth(params, x)),
+            jax.tree.map(scaled, expert),
+            jax.tree.map(scaled, agent),
+            key,
         )
         metrics = {
             "discriminator/loss": cross_entropy,
@@ -103,10 +111,11 @@ def unscaled(x: Array) -> Array:
     return x if x.ndim == 2 else 255.0 * x
 
 
-def separate_encoder(agent: AgentSpec) -> Any:
-    """Returns an encoder like the agent's that a penalty may differentiate twice."""
-    encoder = agent.networks.encoder
-    return encoder.clone(native=False) if isinstance(encoder, PixelEncoder) else encoder
+def twice_differentiable(encoder: Any) -> Any:
+    """Returns the encoder in a form that a penalty may differentiate twice."""
+    if not isinstance(encoder, PixelEncoder):
+        return encoder
+    return encoder.clone(native=False, by_windows=True)
 
 
 def make_transition_rewarder(
@@ -121,6 +130,7 @@ def make_transition_rewarder(
     gradient_penalty: float,
     batch_size: int,
     relabels: bool,
+    penalised: Logits | None = None,
 ) -> Rewarder:
     """Returns the rewarder of a discriminator of transitions.
 
@@ -141,6 +151,7 @@ def make_transition_rewarder(
       batch_size: expert samples, and agent samples, in an update.
       relabels: whether rewards are recomputed for every batch; otherwise they are
         stored.
+      penalised: see `update_discriminator`.
     """
     optimiser = optax.adam(learning_rate)
 
@@ -172,6 +183,7 @@ def make_transition_rewarder(
             penalty_key,
             penalty_weight=gradient_penalty,
             optimiser=optimiser,
+            penalised=penalised,
         )
 
     def rewards(

@@ -11,8 +11,7 @@ from jaxil.networks.discriminator import TransitionDiscriminator
 from jaxil.rewarders.discrimination import (
     Pair,
     make_transition_rewarder,
-    scaled,
-    separate_encoder,
+    twice_differentiable,
     unscaled,
 )
 
@@ -55,26 +54,30 @@ def make_rewarder(
     arXiv:1807.06158; off policy as in Kostrikov et al. 2019, arXiv:1809.02925;
     augmented as in PatchAIL's baseline with an independent encoder.
     """
-    discriminator = TransitionDiscriminator(
-        separate_encoder(agent), agent.feature_dim, hidden_dim
-    )
+    encoder = agent.networks.encoder
+    discriminator = TransitionDiscriminator(encoder, agent.feature_dim, hidden_dim)
+    smooth = discriminator.clone(encoder=twice_differentiable(encoder))
 
     def init_params(key: Array, spec: Spec) -> Params:
         observation = jnp.zeros((1, *spec.observation_shape))
         return discriminator.init(key, observation, observation)
 
     def logits(params: Params, pair: Pair) -> Array:
-        return apply(discriminator, params, *map(unscaled, pair))
+        return apply(discriminator, params, *pair)
+
+    def penalised(params: Params, pair: Pair) -> Array:
+        return apply(smooth, params, *map(unscaled, pair))
 
     return make_transition_rewarder(
         agent,
         init_params=init_params,
-        inputs=lambda learner, observation: scaled(observation),
-        agent_inputs=lambda view: (scaled(view.observation), scaled(view.successor)),
+        inputs=lambda learner, observation: observation,
+        agent_inputs=lambda view: (view.observation, view.successor),
         logits=logits,
         reward=lambda state, logits: logits,
         learning_rate=learning_rate,
         gradient_penalty=gradient_penalty,
         batch_size=batch_size,
         relabels=relabels,
+        penalised=penalised,
     )

@@ -101,13 +101,17 @@ def make_rewarder(
     and every update recomputes s for its batch although the logits are stored.
     """
     discriminator = PatchDiscriminator(width)
+    smooth = discriminator.clone(by_windows=True)
 
     def init_params(key: Array, spec: Spec) -> Params:
         *size, channels = spec.observation_shape
         return discriminator.init(key, jnp.zeros((1, *size, 2 * channels)))
 
     def logits(params: Params, pair: Pair) -> Array:
-        return apply(discriminator, params, jnp.concatenate(pair, axis=-1))
+        return apply(discriminator, params, scaled(jnp.concatenate(pair, axis=-1)))
+
+    def penalised(params: Params, pair: Pair) -> Array:
+        return apply(smooth, params, jnp.concatenate(pair, axis=-1))
 
     def similarity(state: SimilarityState, logits: Array) -> Array:
         return patch_similarity(logits, state.expert_patches)
@@ -122,14 +126,15 @@ def make_rewarder(
     plain = make_transition_rewarder(
         agent,
         init_params=init_params,
-        inputs=lambda learner, observation: scaled(observation),
-        agent_inputs=lambda view: (scaled(view.observation), scaled(view.successor)),
+        inputs=lambda learner, observation: observation,
+        agent_inputs=lambda view: (view.observation, view.successor),
         logits=logits,
         reward=reward,
         learning_rate=learning_rate,
         gradient_penalty=gradient_penalty,
         batch_size=batch_size,
         relabels=relabels,
+        penalised=penalised,
     )
     if variant == "plain":
         return plain
@@ -154,7 +159,7 @@ def make_rewarder(
     ) -> tuple[SimilarityState, Metrics]:
         new, metrics = plain.update(state, learner, view, expert, key)
         assert expert is not None
-        pair = scaled(expert.observation), scaled(expert.successor)
+        pair = jnp.asarray(expert.observation), jnp.asarray(expert.successor)
         probabilities = jnp.mean(jax.nn.sigmoid(logits(new.params, pair)), axis=0)
         return state.replace(
             params=new.params,
@@ -171,9 +176,7 @@ def make_rewarder(
         del learner, expert_episodes
 
         def first_scale() -> Array:
-            x = scaled(
-                stacking.stack_frames(episode.frames, frame_stack=agent.frame_stack)
-            )
+            x = stacking.stack_frames(episode.frames, frame_stack=agent.frame_stack)
             found = similarity(state, logits(state.params, (x[:-1], x[1:])))
             return _FIRST_SIMILARITY[variant] / jnp.mean(found)
 
