@@ -2,17 +2,21 @@
 
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxil import methods
-from jaxil.learner.rewarder import AgentView
+from jaxil.learner.rewarder import AgentSpec, AgentView
 from jaxil.maths.types import Batch, ExpertBatch, Window
+from jaxil.native import build
 from jaxil.networks.agent import critic_features
 from jaxil.networks.discriminator import PatchDiscriminator
 from tests.tiny_agent import (
+    ACTION_DIM,
+    FEATURE_DIM,
     NETWORKS,
     SIDE,
     make_agent,
@@ -146,6 +150,40 @@ def test_expert_above_agent_after_learning(method):
     other = expert._replace(observation=dark[:4])
     with pytest.raises(AssertionError):
         rewarder.update(state, PARAMS, view, other, jax.random.key(0))
+
+
+def test_the_encoder_in_c_changes_no_update():
+    # Only the penalty needs second derivatives; the rest may use the encoder in C.
+    assert build.problem() is None
+    encoder = NETWORKS.encoder.clone(channels=(32,))
+    frames = [jnp.asarray(random_frames(seed, BATCH)) for seed in range(4)]
+    features = jnp.zeros((BATCH, FEATURE_DIM))
+    actions = jnp.zeros((BATCH, ACTION_DIM))
+    view = AgentView(frames[0], features, actions, frames[0], frames[1], features)
+    arguments = PARAMS, view, ExpertBatch(frames[2], actions, frames[3])
+    ends, seen = [], []
+    for native in (False, True):
+        networks = NETWORKS._replace(encoder=encoder.clone(native=native))
+        rewarder = methods.load("gaifo", "make_rewarder")(
+            AgentSpec(networks, frame_stack=1, shift_padding=1),
+            hidden_dim=16,
+            learning_rate=1e-3,
+            gradient_penalty=10.0,
+            batch_size=BATCH,
+            relabels=True,
+        )
+        start = state = rewarder.init(jax.random.key(0), SPEC, PARAMS)
+        traced = jax.jit(rewarder.update).trace(state, *arguments, jax.random.key(1))
+        seen.append("jaxil_encode" in str(traced.jaxpr))
+        update = traced.lower().compile()
+        for number in range(5):
+            key = jax.random.fold_in(jax.random.key(1), number)
+            state, _ = update(state, *arguments, key)
+        moved = jax.tree.map(lambda x, y: x - y, state.params, start.params)
+        ends.append(moved)
+    assert seen == [False, True]
+    chex.assert_trees_all_close(*ends, atol=1e-4)
+    assert min(float(jnp.max(jnp.abs(x))) for x in jax.tree.leaves(ends[0])) > 4e-4
 
 
 def test_laifo_decides_where_the_logit_is_above_zero():
