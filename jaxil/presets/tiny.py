@@ -32,8 +32,9 @@ shadows. Other deviations from the paper:
   80 % of the expert at 20k, 30k and 50k frames; with one update three of five did, at
   40k to 80k, in about the same time.
 - On ball_in_cup_catch the other methods repeat actions 4 times, which needs half the
-  time for as many frames. P-SIL's rewards stay as they were stored there: with rewards recomputed one of nine runs reached 80 % of the expert within 71k
-  to 202k frames, and with stored ones all of eight did within 80k to 180k.
+  time for as many frames. P-SIL's rewards stay as they were stored there: with rewards
+  recomputed one of nine runs reached 80 % of the expert within 71k to 202k frames, and
+  with stored ones all of eight did within 80k to 180k.
 - cartpole_swingup is seen by the camera that follows the cart. DrQ-v2's shows the pole
   one pixel wide, and not at all at the rail's ends: agents needed more frames, and then
   kept dropping the pole. Demonstrations in pixels of another renderer may need

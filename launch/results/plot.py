@@ -49,6 +49,7 @@ class Kind(NamedTuple):
 _KINDS = {
     "pdac": Kind("P-DAC, today's small preset", "#0072B2", width=2.2),
     "psil": Kind("P-SIL, today's small preset", "#D55E00", width=2.2),
+    "laifo": Kind("LAIfO, today's small preset", "#882255", width=2.2),
     "pdac, changed": Kind("P-DAC, other settings", "#56B4E9"),
     "psil, changed": Kind("P-SIL, other settings", "#E69F00"),
     "drqv2": Kind("true reward", "#009E73"),
@@ -79,7 +80,8 @@ def kind_of(name: str, config: Mapping[str, Any]) -> str:
         return "pdac, changed"
     if method == "drqv2" or is_of_preset(config):
         return method
-    return f"{method}, changed"
+    changed = f"{method}, changed"
+    return changed if changed in _KINDS else "other"
 
 
 def is_of_preset(config: Mapping[str, Any]) -> bool:

@@ -42,6 +42,7 @@ PDAC = pdac.make_rewarder(
     batch_size=4,
     sees_actions=False,
     num_components=0,
+    reward="logit",
 )
 PSIL = psil.make_rewarder(
     AGENT,
