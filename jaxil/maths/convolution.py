@@ -24,8 +24,8 @@ def convolve_by_windows(images: Array, kernel: Array, stride: int) -> Array:
     """Returns what `convolve` does, as a matrix product with every window.
 
     Gradients of its gradient, which penalties on pixels take, need a third of the time
-    of XLA's convolutions on a CPU. It holds all windows in memory, so other devices
-    convolve as above.
+    of XLA's convolutions on a CPU. It holds all windows in memory (GAIfO's step at the
+    paper's sizes takes 2.2 GiB in place of 0.9), so other devices convolve as above.
     """
     chex.assert_rank([images, kernel], 4)
     return lax.platform_dependent(
