@@ -42,16 +42,10 @@ COMPONENTS = Field(
     0,
     1024,
 )
-DISCRIMINATOR_REWARD = Field(
-    "logit",
-    "logit: P-DAC's; decision: 1 where it takes the agent for the expert, else 0",
-    choices=("logit", "decision"),
-)
 PDAC_DISCRIMINATOR = {
     **DISCRIMINATOR,
     "sees_actions": Field(False, "appends actions to the features"),
     "num_components": COMPONENTS,
-    "reward": DISCRIMINATOR_REWARD,
 }
 CLONING = {
     "batch_size": Field(128, "expert samples; 128 in ROT", 1, 65_536),

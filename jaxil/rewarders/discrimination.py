@@ -93,19 +93,6 @@ def update_discriminator(
     return apply_gradients(state, gradients, optimiser), metrics
 
 
-def judged(logits: Array, reward: str) -> Array:
-    """Returns rewards of logits: these, or decisions, 1 where positive and 0 elsewhere.
-
-    Args:
-      logits: positive for the expert. Shape [M].
-      reward: "logit" or "decision".
-
-    Source: decisions are of VittorioGiammarino/AIL_from_visual_obs, LAIfO's code.
-    """
-    chex.assert_rank(logits, 1)
-    return logits if reward == "logit" else (logits > 0.0).astype(logits.dtype)
-
-
 def mean_logit(logits: Array) -> Array:
     """Returns the mean over all axes but the first."""
     return jnp.mean(logits, axis=tuple(range(1, logits.ndim)))

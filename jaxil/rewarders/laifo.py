@@ -4,12 +4,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxil import methods
-from jaxil.learner.rewarder import AgentSpec, Rewarder, Spec
+from jaxil.learner.rewarder import AgentSpec, Rewarder, RewarderState, Spec
 from jaxil.learner.state import LearnerParams
 from jaxil.maths.types import Params
 from jaxil.networks.agent import apply, critic_features
 from jaxil.networks.discriminator import Discriminator
-from jaxil.rewarders.discrimination import Pair, judged, make_transition_rewarder
+from jaxil.rewarders.discrimination import Pair, make_transition_rewarder
 
 METHOD = methods.Method(
     name="laifo",
@@ -23,7 +23,12 @@ METHOD = methods.Method(
             "learning_rate": methods.Field(
                 4e-4, "of its Adam; 4e-4 in the paper", 0, 1, positive=True
             ),
-            "reward": methods.DISCRIMINATOR_REWARD._replace(default="decision"),
+            "reward": methods.Field(
+                "decision",
+                "decision: 1 where it takes the agent for the expert, else 0, as in "
+                "the authors' code; logit: as in P-DAC",
+                choices=("decision", "logit"),
+            ),
             "relabels": methods.RELABELS,
         }
     },
@@ -76,13 +81,17 @@ def make_rewarder(
     def logits(params: Params, pair: Pair) -> Array:
         return apply(discriminator, params, jnp.concatenate(pair, axis=-1))
 
+    def rewarded(state: RewarderState, logits: Array) -> Array:
+        del state
+        return logits if reward == "logit" else (logits > 0.0).astype(logits.dtype)
+
     return make_transition_rewarder(
         agent,
         init_params=init_params,
         inputs=inputs,
         agent_inputs=lambda view: (view.features, view.successor_features),
         logits=logits,
-        reward=lambda state, logits: judged(logits, reward),
+        reward=rewarded,
         learning_rate=learning_rate,
         gradient_penalty=gradient_penalty,
         batch_size=batch_size,

@@ -18,7 +18,7 @@ from jaxil.networks.discriminator import Discriminator
 from jaxil.networks.encoder import PixelEncoder
 from jaxil.rewarders import codes
 from jaxil.rewarders.codes import FrameCode
-from jaxil.rewarders.discrimination import judged, update_discriminator
+from jaxil.rewarders.discrimination import update_discriminator
 
 METHOD = methods.Method(
     name="pdac",
@@ -29,10 +29,7 @@ METHOD = methods.Method(
     sections={"discriminator": methods.PDAC_DISCRIMINATOR},
     sees_actions="discriminator.sees_actions",
     metrics=methods.DISCRIMINATOR_METRICS,
-    variations=(
-        methods.Variation("discriminator.sees_actions", False, "actions"),
-        methods.Variation("discriminator.reward", "logit", "{}"),
-    ),
+    variations=(methods.Variation("discriminator.sees_actions", False, "actions"),),
 )
 
 
@@ -55,7 +52,6 @@ def make_rewarder(
     batch_size: int,
     sees_actions: bool,
     num_components: int,
-    reward: str,
 ) -> Rewarder:
     """Returns the rewarder of P-DAC.
 
@@ -78,7 +74,6 @@ def make_rewarder(
       sees_actions: whether actions are appended to the features: D(x_t, a_t).
       num_components: of each frame; 0, the paper's: the critic's features, as always
         for state vectors, which have no code.
-      reward: "logit", the equation above, or "decision", see `judged`.
 
     Source: Cohen et al. 2021, sec. 3.2; sizes and rates, which the paper leaves
     out, from siddhanthaldar/ROT. The code of pixels is this project's own.
@@ -178,9 +173,8 @@ def make_rewarder(
         del expert_episodes
         features = features_of(state, learner, episode.frames)
         # r(o_{t+1}), as in the reference; with actions the pair is (o_t, a_t).
-        seen = features[:-1] if sees_actions else features[1:]
-        found = logits(state.params, inputs(seen, episode.actions))
-        return judged(found, reward)
+        judged = features[:-1] if sees_actions else features[1:]
+        return logits(state.params, inputs(judged, episode.actions))
 
     return Rewarder(
         rewards,

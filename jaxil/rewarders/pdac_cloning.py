@@ -34,7 +34,6 @@ def make_rewarder(
     batch_size: int,
     sees_actions: bool,
     num_components: int,
-    reward: str,
     num_pairs: int,
     weight: float,
     trust: str,
@@ -52,7 +51,6 @@ def make_rewarder(
         batch_size=batch_size,
         sees_actions=sees_actions,
         num_components=num_components,
-        reward=reward,
     )
     return with_cloning(
         inner,

@@ -42,7 +42,6 @@ PDAC = pdac.make_rewarder(
     batch_size=4,
     sees_actions=False,
     num_components=0,
-    reward="logit",
 )
 PSIL = psil.make_rewarder(
     AGENT,

@@ -15,9 +15,7 @@ SPEC = make_spec(expert_steps=4)
 
 
 @functools.cache
-def make_rewarder(
-    frame_stack=1, sees_actions=False, shift_padding=0, num_components=0, reward="logit"
-):
+def make_rewarder(frame_stack=1, sees_actions=False, shift_padding=0, num_components=0):
     rewarder = pdac.make_rewarder(
         make_agent(frame_stack, shift_padding),
         hidden_dim=16,
@@ -26,7 +24,6 @@ def make_rewarder(
         batch_size=BATCH,
         sees_actions=sees_actions,
         num_components=num_components,
-        reward=reward,
     )
     return rewarder._replace(
         rewards=jax.jit(rewarder.rewards),

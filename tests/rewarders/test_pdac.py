@@ -97,20 +97,6 @@ def test_the_reward_is_the_logit_of_critic_features():
     np.testing.assert_allclose(rewards, expected, rtol=1e-4, atol=1e-4)
 
 
-def test_a_decision_is_one_where_the_logit_is_positive():
-    rewarder, params = make_rewarder(), make_params(0)
-    episode = make_episode(random_frames(0, STEPS + 1))
-    state = rewarder.init(jax.random.key(0), SPEC, params)
-    middle = np.median(rewarder.rewards(state, params, episode, None))
-    shifted = jax.tree.map(lambda leaf: leaf - middle * (leaf.size == 1), state.params)
-    state = state.replace(params=shifted)
-    logits = np.asarray(rewarder.rewards(state, params, episode, None))
-    decides = make_rewarder(reward="decision")
-    decisions = decides.rewards(state, params, episode, None)
-    np.testing.assert_array_equal(decisions, logits > 0.0)
-    assert logits.min() < 0.0 < logits.max()
-
-
 def test_reads_the_critics_trunk_and_nothing_of_the_actor():
     rewarder, params, other = make_rewarder(), make_params(0), make_params(1)
     frames = random_frames(0, STEPS + 1)

@@ -90,6 +90,5 @@ def test_state_vectors_have_no_components():
         batch_size=BATCH,
         sees_actions=False,
         num_components=3,
-        reward="logit",
     )
     assert not rewarder.matches_episodes
