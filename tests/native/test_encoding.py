@@ -35,7 +35,9 @@ def reference(pixels, mean, weights, *, contrast, strides):
         - jnp.broadcast_to(mean, pixels.shape[1:])[None]
     )
     for (kernel, bias), stride in zip(weights, strides, strict=True):
-        x = jax.nn.relu(convolution.convolve(x, kernel, stride) + bias)
+        x = jax.nn.relu(
+            convolution.convolve(x, kernel, stride) + bias[None, None, None]
+        )
     return x
 
 
@@ -330,7 +332,7 @@ build.register(library)
 def theirs(weights):
     x = pixels.astype("f") / 255 - mean
     for (kernel, bias), stride in zip(weights, (2, 1, 1)):
-        x = jax.nn.relu(convolution.convolve(x, kernel, stride) + bias)
+        x = jax.nn.relu(convolution.convolve(x, kernel, stride) + bias[None, None, None])
     return x
 for mine, other in zip(both(ours), both(theirs)):
     np.testing.assert_allclose(mine, other, atol=1e-4 * np.abs(other).max())
