@@ -24,7 +24,7 @@ class PixelEncoder(nn.Module):
       dtype: of the convolutions; parameters are always float32.
       native: whether `encoding.encode` is used for uint8 pixels. It supports float32,
         channels in multiples of 32, and first derivatives.
-      by_windows: see `Convolution`; without effect where `native` has one.
+      by_windows: see `Convolution`; `native` goes before it.
 
     Source: facebookresearch/drqv2, drqv2.py, `Encoder`.
     """
