@@ -77,6 +77,10 @@ class UsageError(Exception):
         return "Invalid configuration:\n" + "\n".join(f"  - {f}" for f in shown)
 
 
+class EnvironmentsFailed(RuntimeError):
+    """An environment raised an error in an episode, or its process keeps dying."""
+
+
 def raised(error: BaseException) -> str:
     """Returns what code that jaxil called raised, and the user's line nearest to it.
 

@@ -9,7 +9,7 @@ Rerun the same command to resume. `python -m jaxil.launch` is the same command.
 from absl import flags
 
 from jaxil import command
-from jaxil.errors import UsageError
+from jaxil.errors import EnvironmentsFailed, UsageError
 
 
 def main(argv: list[str]) -> int:
@@ -23,7 +23,6 @@ def main(argv: list[str]) -> int:
     screen.say(startup.prepare())
 
     from jaxil import doctor, train
-    from jaxil.environments.pool import EnvironmentsFailed
     from jaxil.machine import devices, provenance
     from jaxil.training import agent as agents
     from jaxil.training import assembly

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxil import methods
 from jaxil.config import Config
-from jaxil.environments.pool import EnvironmentsFailed
+from jaxil.errors import EnvironmentsFailed
 from jaxil.machine import screen
 from jaxil.machine.signals import StopOnSignals
 from jaxil.maths.types import Episode
@@ -58,7 +58,7 @@ class Run(Parts):
             to their end, so that they are stored and the last evaluation takes place.
 
         Raises:
-          EnvironmentsFailed: there are several, and they cannot go on.
+          EnvironmentsFailed: the task raised an error, or its processes keep dying.
           TrainingDiverged: a loss or reward is not finite any more.
         """
         config, counters, player = self.config, self.counters, self.player
@@ -291,12 +291,12 @@ class Run(Parts):
         self.progress.close()
         if self.counters.last_checkpoint_step != self.counters.num_steps:
             self.save()
-        self.log.close()
 
     def close(self) -> None:
-        """Ends the processes of several environments."""
+        """Ends the processes of several environments, and closes the loggers."""
         if self.player is not None:
             self.player.close()
+        self.log.close()
 
     def ask_to_stop(self, who: str) -> bool:
         """Makes the loop end after this step; returns False if already asked to."""

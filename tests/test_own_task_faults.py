@@ -9,6 +9,7 @@ from dm_env import specs
 
 from jaxil.environments import tasks
 from jaxil.environments.pixel_environment import PixelEnvironment
+from tests.commands import call, small
 
 _BLACK = np.zeros((8, 8, 3), np.uint8)
 
@@ -120,6 +121,27 @@ def test_an_error_of_the_task_says_where_it_is(monkeypatch):
     monkeypatch.setitem(globals(), "failing", failing)
     (fault,) = tasks.problems(f"{__name__}:failing", **settings())
     assert "ValueError: no light (test_own_task_faults.py, line " in str(fault)
+
+
+def test_an_error_in_mid_episode_ends_a_run_in_one_message(monkeypatch, tmp_path):
+    class Exploding(Task):
+        step_limit, time = 12, 0
+
+        def step(self, action):
+            self.time += 1
+            if self.time > 20:
+                raise FloatingPointError("NaN in the simulation")
+            return super().step(action)
+
+    monkeypatch.setitem(globals(), "exploding", Exploding)
+    task = f"{__name__}:exploding"
+    flags = (f"--config=drqv2:{task}", *small("drqv2"), f"--workdir={tmp_path}")
+    ended = call("launch", *flags, "--config.action_repeat=1")
+    assert ended.returncode == 1
+    assert "training stopped: the task raised an error in mid-episode" in ended.stderr
+    assert "NaN in the simulation (test_own_task_faults.py, line " in ended.stderr
+    assert "Rerun the same command to resume" in ended.stderr
+    assert "Traceback" not in ended.stderr
 
 
 def settings():

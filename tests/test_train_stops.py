@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxil import train
-from jaxil.environments.pool import EnvironmentsFailed
+from jaxil.errors import EnvironmentsFailed
 from tests.dummies import Dummies, acts_and_episodes, make_config
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxil.environments.interaction import Environments, Moment
+from jaxil.errors import EnvironmentsFailed, raised
 from jaxil.maths.types import Episode
 
 
@@ -168,6 +169,9 @@ class Player:
 
         Returns:
           The episodes that ended, in the order of their numbers.
+
+        Raises:
+          EnvironmentsFailed: a task raised an error, or its process keeps dying.
         """
         finished = []
         for index in self._order():
@@ -189,7 +193,13 @@ class Player:
         self._environments.step(index, action)
 
     def _receive(self, index: int) -> None:
-        moment = self._environments.receive(index)
+        try:
+            moment = self._environments.receive(index)
+        except EnvironmentsFailed:
+            raise
+        except Exception as error:
+            what = "the task raised an error in mid-episode"
+            raise EnvironmentsFailed(f"{what}: {raised(error)}") from error
         if moment is None:  # lost, and the episode with it
             self._begin_anew(index)
         else:

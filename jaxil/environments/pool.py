@@ -15,16 +15,13 @@ import numpy as np
 
 from jaxil.environments.interaction import Moment
 from jaxil.environments.player import InProcess
+from jaxil.errors import EnvironmentsFailed
 
 # Rendered in software, the heaviest task takes a second per step; imports and the first
 # image take 5 s, or a minute on a busy machine.
 _STEP_SECONDS, _START_SECONDS = 60.0, 300.0
 _EXIT_SECONDS = 10.0  # for a killed process to disappear
 _MAX_LOSSES = 3  # in a row, without a whole episode
-
-
-class EnvironmentsFailed(RuntimeError):
-    """An environment raised an error, or keeps dying."""
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxil.learner.rewarder import Rewarder
-from jaxil.maths.types import Episode
+from jaxil.maths.types import AnyEpisode
 
 
 def checked_rewarder(name: str, rewarder: Rewarder) -> Rewarder:
@@ -22,7 +22,7 @@ def checked_rewarder(name: str, rewarder: Rewarder) -> Rewarder:
       rewarder: see `Rewarder`.
     """
 
-    def rewards(state: Any, learner: Any, episode: Episode, experts: Any) -> Array:
+    def rewards(state: Any, learner: Any, episode: AnyEpisode, experts: Any) -> Array:
         found = rewarder.rewards(state, learner, episode, experts)
         expected, shape = (episode.actions.shape[0],), getattr(found, "shape", None)
         if shape != expected:

@@ -10,12 +10,13 @@ from jax import Array
 
 from jaxil.learner.state import LearnerParams
 from jaxil.maths.types import (
+    AnyEpisode,
     Batch,
     Data,
-    Episode,
     ExpertBatch,
     ExpertEpisodes,
     Metrics,
+    PaddedEpisode,
 )
 from jaxil.networks.agent import AgentNetworks
 
@@ -101,7 +102,7 @@ def _keep(
 def _ignore_episode(
     state: RewarderState,
     learner: LearnerParams,
-    episode: Episode,
+    episode: AnyEpisode,
     expert_episodes: ExpertEpisodes | None,
 ) -> RewarderState:
     del learner, episode, expert_episodes
@@ -125,9 +126,9 @@ class Rewarder(NamedTuple):
         not, `expert_episodes` is None.
       samples_successors: whether samples of agent and expert include the observation
         one step later.
-      ignores_later_frames: whether reward t depends on frames up to t + 1 alone, and
-        not on how long the episode is. If so, `rewards` gets shorter episodes with
-        their last frame and action repeated, and is compiled for fewer lengths.
+      ignores_padding: whether `observe` and the first `episode.num_steps` rewards do
+        not depend on what follows these steps. If so, both get short episodes with
+        their last frame and action repeated, and are compiled for fewer lengths.
       relabel: (state, learner, batch) -> rewards [B, n], for methods that reward each
         batch by the current state; `batch` has its window. None where rewards are
         stored.
@@ -143,7 +144,7 @@ class Rewarder(NamedTuple):
     """
 
     rewards: Callable[
-        [RewarderState, LearnerParams, Episode, ExpertEpisodes | None], Array
+        [RewarderState, LearnerParams, AnyEpisode, ExpertEpisodes | None], Array
     ]
     init: Callable[[Array, Spec, LearnerParams], RewarderState] = _no_state
     update: Callable[
@@ -151,12 +152,12 @@ class Rewarder(NamedTuple):
         tuple[RewarderState, Metrics],
     ] = _keep
     observe: Callable[
-        [RewarderState, LearnerParams, Episode, ExpertEpisodes | None], RewarderState
+        [RewarderState, LearnerParams, AnyEpisode, ExpertEpisodes | None], RewarderState
     ] = _ignore_episode
     expert_batch_size: int = 0
     matches_episodes: bool = False
     samples_successors: bool = False
-    ignores_later_frames: bool = False
+    ignores_padding: bool = False
     relabel: Callable[[RewarderState, LearnerParams, Batch], Array] | None = None
     rewards_changed: Callable[[RewarderState], Array | bool] | None = None
     actor_loss: (
@@ -167,7 +168,7 @@ class Rewarder(NamedTuple):
     ) = None
     plan: (
         Callable[
-            [RewarderState, LearnerParams, Episode, ExpertEpisodes],
+            [RewarderState, LearnerParams, AnyEpisode, ExpertEpisodes],
             tuple[Array, Array],
         ]
         | None
@@ -179,10 +180,11 @@ def make_refresh(rewarder: Rewarder) -> Callable[..., Array]:
     """Returns the function that recomputes the rewards of stored episodes.
 
         (rewarder state, learner, frames [M, ...], indices [E, T + 1],
-         actions [E, T, A], expert episodes) -> rewards [E, T]
+         actions [E, T, A], their numbers of steps [E], expert episodes)
+         -> rewards [E, T]
 
     Each row is what `rewarder.rewards` returns for that episode now. `indices` say
-    where each episode's frames are in `frames`; all episodes have one length.
+    where each episode's frames are in `frames`; all episodes are padded to one length.
 
     Args:
       rewarder: its rewards must depend on frames and actions alone, since task rewards
@@ -195,22 +197,24 @@ def make_refresh(rewarder: Rewarder) -> Callable[..., Array]:
         frames: Data,
         indices: Data,
         actions: Data,
+        num_steps: Data,
         expert_episodes: ExpertEpisodes | None,
     ) -> Array:
-        chex.assert_rank([frames, indices, actions], [{2, 4}, 2, 3])
-        chex.assert_equal_shape_prefix([indices, actions], 1)
-        num_steps = actions.shape[1]
-        chex.assert_axis_dimension(indices, 1, num_steps + 1)
+        stored = tuple(jnp.asarray(each) for each in (indices, actions, num_steps))
+        chex.assert_rank([frames, *stored], [{2, 4}, 2, 3, 1])
+        chex.assert_equal_shape_prefix(stored, 1)
+        length = actions.shape[1]
+        chex.assert_axis_dimension(indices, 1, length + 1)
         frames = jnp.asarray(frames)
-        unknown = jnp.full(num_steps, jnp.nan)
+        unknown = jnp.full(length, jnp.nan)
 
-        def episode_rewards(stored: tuple[Array, Array]) -> Array:
-            frame_indices, taken = stored
-            episode = Episode(frames[frame_indices], taken, unknown, unknown)
+        def episode_rewards(stored: tuple[Array, Array, Array]) -> Array:
+            frame_indices, taken, steps = stored
+            shown = frames[frame_indices]
+            episode = PaddedEpisode(shown, taken, unknown, unknown, steps)
             return rewarder.rewards(state, learner, episode, expert_episodes)
 
         # One at a time: a batch of episodes would need gigabytes.
-        stored = (jnp.asarray(indices), jnp.asarray(actions))
         return jax.lax.map(episode_rewards, stored)
 
     return refresh

@@ -1,7 +1,5 @@
 """Entropic optimal transport between two episodes as sets of features."""
 
-import math
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -44,38 +42,45 @@ def euclidean_cost(x: Array, y: Array) -> Array:
     return jnp.sqrt(jnp.maximum(squares, _NORM_FLOOR))
 
 
-def simultaneous_plan(cost: Array, expert_mass: Array) -> Array:
+def simultaneous_plan(cost: Array, agent_mass: Array, expert_mass: Array) -> Array:
     """Returns the plan [T, N] that pairs step t with step t, without transport.
 
-        P_tn = 1/T  for  n = min(t, number of expert steps - 1),  else 0
+        P_tn = a_t  for  n = min(t, number of expert steps - 1),  else 0
 
-    Only the shape of `cost` is used; `expert_mass` is 0 beyond the expert's own steps.
+    Only the shape of `cost` is used. Masses are 0 beyond an episode's own steps.
 
     Source: Cohen et al. 2021, fig. 7.
     """
-    chex.assert_rank([cost, expert_mass], [2, 1])
-    chex.assert_equal_shape_suffix([cost, expert_mass], 1)
+    chex.assert_rank([cost, agent_mass, expert_mass], [2, 1, 1])
+    chex.assert_shape(cost, (*agent_mass.shape, *expert_mass.shape))
     num_steps, length = cost.shape
     last = jnp.sum(expert_mass > 0.0) - 1
     partners = jnp.minimum(jnp.arange(num_steps), last)
-    return jax.nn.one_hot(partners, length, dtype=cost.dtype) / num_steps
+    pairs = jax.nn.one_hot(partners, length, dtype=cost.dtype)
+    return agent_mass[:, None] * pairs
 
 
 def sinkhorn_plan(
-    cost: Array, expert_mass: Array, *, epsilon: float, num_iterations: int
+    cost: Array,
+    agent_mass: Array,
+    expert_mass: Array,
+    *,
+    epsilon: float,
+    num_iterations: int,
 ) -> Array:
-    """Returns the entropic transport plan; all steps of the agent have equal mass.
+    """Returns the entropic transport plan.
 
-        P = argmin <P, C> - epsilon * H(P)   with   P 1 = 1/T,  P^T 1 = b
+        P = argmin <P, C> - epsilon * H(P)   with   P 1 = a,  P^T 1 = b
 
     Computed in the log domain, since exp(-C / epsilon) underflows in float32 at the
     epsilon that imitation needs. The last iteration normalises the rows, so each step
-    of the agent has exactly mass 1/T and rewards are not distorted. A fixed number of
+    of the agent has exactly its mass and rewards are not distorted. A fixed number of
     iterations keeps a vmap over demonstrations parallel.
 
     Args:
       cost: pairwise costs. Shape [T, N].
-      expert_mass: b, see `uniform_mass`; sums to one. Shape [N].
+      agent_mass: a, see `uniform_mass`; sums to one. Shape [T].
+      expert_mass: b, likewise. Shape [N].
       epsilon: weight of the entropy, in units of cost.
       num_iterations: Sinkhorn iterations; static under jit.
 
@@ -85,11 +90,10 @@ def sinkhorn_plan(
 
     Source: Peyre and Cuturi 2019, Computational Optimal Transport, sec. 4.4.
     """
-    chex.assert_rank([cost, expert_mass], [2, 1])
-    chex.assert_equal_shape_suffix([cost, expert_mass], 1)
-    num_steps, length = cost.shape
+    chex.assert_rank([cost, agent_mass, expert_mass], [2, 1, 1])
+    chex.assert_shape(cost, (*agent_mass.shape, *expert_mass.shape))
     scaled = cost / epsilon
-    log_agent, log_expert = -math.log(num_steps), jnp.log(expert_mass)
+    log_agent, log_expert = jnp.log(agent_mass), jnp.log(expert_mass)
 
     def iterate(_, potentials):
         rows, _ = potentials
@@ -97,7 +101,8 @@ def sinkhorn_plan(
         rows = log_agent - logsumexp(columns[None] - scaled, axis=1)
         return rows, columns
 
-    start = jnp.zeros(num_steps), jnp.zeros(length)
+    # Rows without mass must not count in the first iteration either.
+    start = jnp.where(agent_mass > 0.0, 0.0, -jnp.inf), jnp.zeros_like(expert_mass)
     rows, columns = lax.fori_loop(0, num_iterations, iterate, start)
     return jnp.exp(rows[:, None] + columns[None] - scaled)
 
@@ -121,8 +126,10 @@ def sinkhorn_divergence(
 
     def transport_cost(x: Array, y: Array) -> Array:
         cost = cosine_cost(x, y)
-        mass = uniform_mass(jnp.asarray(len(y)), len(y))
-        plan = sinkhorn_plan(cost, mass, epsilon=epsilon, num_iterations=num_iterations)
+        masses = (uniform_mass(jnp.asarray(len(each)), len(each)) for each in (x, y))
+        plan = sinkhorn_plan(
+            cost, *masses, epsilon=epsilon, num_iterations=num_iterations
+        )
         kl_to_product = jnp.sum(xlogy(plan, plan * cost.size))  # a_i b_j = 1 / size
         return jnp.sum(plan * cost) + epsilon * kl_to_product
 

@@ -107,6 +107,31 @@ class Episode(NamedTuple):
     rewards: Data
     discounts: Data
 
+    @property
+    def num_steps(self) -> int:
+        """T."""
+        return len(self.actions)
+
+
+class PaddedEpisode(NamedTuple):
+    """An episode whose last frame, action, reward and discount may be repeated.
+
+    Functions that are compiled for a shape get few shapes this way.
+
+    Attributes:
+      frames, actions, rewards, discounts: as in `Episode`, with T no less than its own.
+      num_steps: the episode's own T; what follows is padding. Shape [].
+    """
+
+    frames: Data
+    actions: Data
+    rewards: Data
+    discounts: Data
+    num_steps: Data
+
+
+AnyEpisode = Episode | PaddedEpisode
+
 
 class ExpertEpisodes(NamedTuple):
     """The demonstrations, frames not stacked.

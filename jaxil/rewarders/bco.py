@@ -77,7 +77,7 @@ def make_rewarder(
         init,
         expert_batch_size=batch_size,
         samples_successors=True,
-        ignores_later_frames=True,
+        ignores_padding=True,
     )
 
 

@@ -7,7 +7,7 @@ from jax import Array
 
 from jaxil.learner.rewarder import AgentSpec, Rewarder, Spec
 from jaxil.learner.state import LearnerParams
-from jaxil.maths.types import Episode, ExpertEpisodes
+from jaxil.maths.types import AnyEpisode, ExpertEpisodes
 from jaxil.rewarders import codes
 from jaxil.rewarders.comparison import Compare, make_comparing_rewarder
 
@@ -65,7 +65,7 @@ def make_coded_rewarder(
     def update_features(
         state: CodedState,
         learner: LearnerParams,
-        episode: Episode,
+        episode: AnyEpisode,
         expert_episodes: ExpertEpisodes,
     ) -> CodedState:
         del learner

@@ -7,7 +7,7 @@ from flax import struct
 from jax import Array
 
 from jaxil.maths import components, stacking
-from jaxil.maths.types import Episode, ExpertEpisodes
+from jaxil.maths.types import AnyEpisode, ExpertEpisodes
 from jaxil.rewarders.discrimination import scaled
 
 # Four episodes, usual before the first update, weigh as much as all demonstrations.
@@ -49,19 +49,19 @@ def init_code(
     )
 
 
-def observe(code: FrameCode, episode: Episode, experts: ExpertEpisodes) -> FrameCode:
+def observe(code: FrameCode, episode: AnyEpisode, experts: ExpertEpisodes) -> FrameCode:
     """Returns the code fitted to one more episode, unless it is fixed."""
     return jax.lax.cond(
         code.is_fixed, lambda: code, lambda: fit(code, episode, experts)
     )
 
 
-def fit(code: FrameCode, episode: Episode, experts: ExpertEpisodes) -> FrameCode:
+def fit(code: FrameCode, episode: AnyEpisode, experts: ExpertEpisodes) -> FrameCode:
     """Returns the code fitted to one more episode; a new one also to demonstrations."""
     code = jax.lax.cond(
         code.num_rows == 0.0, lambda: _begin(code, experts), lambda: code
     )
-    return _merge(code, _sample_episode(episode.frames))
+    return _merge(code, *_sample_episode(episode))
 
 
 def fix(code: FrameCode) -> FrameCode:
@@ -107,13 +107,16 @@ def encode_episode(code: FrameCode, frames: Array, *, frame_stack: int) -> Array
 
 def _begin(code: FrameCode, experts: ExpertEpisodes) -> FrameCode:
     rows = _sample_demonstrations(experts)
-    return _merge(code.replace(mean=jnp.mean(rows, axis=0)), rows)
+    code = code.replace(mean=jnp.mean(rows, axis=0))
+    return _merge(code, rows, jnp.ones(len(rows)))
 
 
-def _merge(code: FrameCode, rows: Array) -> FrameCode:
+def _merge(code: FrameCode, rows: Array, weights: Array) -> FrameCode:
+    """Returns the code fitted to rows [M, P] too, which count 1 or 0 times, [M]."""
+    weighted = weights[:, None] * (rows - code.mean[None])
     return code.replace(
-        sketch=components.merge(code.sketch, rows - code.mean[None]),
-        num_rows=code.num_rows + len(rows),
+        sketch=components.merge(code.sketch, weighted),
+        num_rows=code.num_rows + jnp.sum(weights),
     )
 
 
@@ -126,9 +129,16 @@ def _sample_demonstrations(experts: ExpertEpisodes) -> Array:
     return _rows(jnp.asarray(experts.frames)[which, moment.astype(jnp.int32)])
 
 
-def _sample_episode(frames: Array) -> Array:
-    moments = jnp.linspace(0, len(frames) - 1, min(_EPISODE_ROWS, len(frames)))
-    return _rows(jnp.asarray(frames)[moments.astype(jnp.int32)])
+def _sample_episode(episode: AnyEpisode) -> tuple[Array, Array]:
+    """Returns frames evenly spaced over an episode, [M, P], and their weights, [M].
+
+    A short episode has each frame once; rows of its padding weigh 0.
+    """
+    frames, num_steps = jnp.asarray(episode.frames), episode.num_steps
+    num_rows = min(_EPISODE_ROWS, len(frames))
+    moments = jnp.linspace(0, jnp.maximum(num_steps, num_rows - 1), num_rows)
+    moments = moments.astype(jnp.int32)
+    return _rows(frames[moments]), (moments <= num_steps).astype(jnp.float32)
 
 
 def _rows(frames: Array) -> Array:

@@ -8,19 +8,19 @@ from jax import Array
 
 from jaxil.learner.rewarder import Rewarder
 from jaxil.learner.state import LearnerParams
-from jaxil.maths.types import Episode, ExpertEpisodes
+from jaxil.maths.types import AnyEpisode, ExpertEpisodes
 from jaxil.rewarders.matching import scale_of_first_episode
 
-# (agent features [T + 1, D], expert features [K, N + 1, D], their lengths without
-# padding [K]) -> rewards [T + 1] of o_0 ... o_T, or a plan [T + 1, N + 1] and the index
-# of its demonstration.
-Compare = Callable[[Array, Array, Array], Any]
+# (agent features [T + 1, D], their number without padding [], expert features
+# [K, N + 1, D], their numbers without padding [K]) -> rewards [T + 1] of o_0 ... o_T, 0
+# for padding, or a plan [T + 1, N + 1] and the index of its demonstration.
+Compare = Callable[[Array, Array, Array, Array], Any]
 
 
 def make_comparing_rewarder(
     *,
     init: Callable[..., Any],
-    update_features: Callable[[Any, LearnerParams, Episode, ExpertEpisodes], Any],
+    update_features: Callable[[Any, LearnerParams, AnyEpisode, ExpertEpisodes], Any],
     embed: Callable[[Any, Array], Array],
     compare: Compare,
     plan: Compare | None,
@@ -48,15 +48,20 @@ def make_comparing_rewarder(
     def compare_with(
         function: Compare,
         state: Any,
-        episode: Episode,
+        episode: AnyEpisode,
         expert_episodes: ExpertEpisodes | None,
     ) -> Any:
         assert expert_episodes is not None
         features = embed(state, jnp.asarray(episode.frames))
-        return function(features, state.expert_features, expert_episodes.num_frames)
+        return function(
+            features,
+            jnp.asarray(episode.num_steps) + 1,
+            state.expert_features,
+            jnp.asarray(expert_episodes.num_frames),
+        )
 
     def unscaled(
-        state: Any, episode: Episode, expert_episodes: ExpertEpisodes | None
+        state: Any, episode: AnyEpisode, expert_episodes: ExpertEpisodes | None
     ) -> Array:
         # Reward t is that of o_{t+1}.
         return compare_with(compare, state, episode, expert_episodes)[1:]
@@ -64,7 +69,7 @@ def make_comparing_rewarder(
     def observe(
         state: Any,
         learner: LearnerParams,
-        episode: Episode,
+        episode: AnyEpisode,
         expert_episodes: ExpertEpisodes | None,
     ) -> Any:
         assert expert_episodes is not None
@@ -81,7 +86,7 @@ def make_comparing_rewarder(
     def rewards(
         state: Any,
         learner: LearnerParams,
-        episode: Episode,
+        episode: AnyEpisode,
         expert_episodes: ExpertEpisodes | None,
     ) -> Array:
         del learner
@@ -90,7 +95,7 @@ def make_comparing_rewarder(
     def plan_of(
         state: Any,
         learner: LearnerParams,
-        episode: Episode,
+        episode: AnyEpisode,
         expert_episodes: ExpertEpisodes,
     ) -> tuple[Array, Array]:
         del learner
@@ -102,6 +107,7 @@ def make_comparing_rewarder(
         init,
         observe=observe,
         matches_episodes=True,
+        ignores_padding=True,
         rewards_changed=rewards_changed,
         plan=None if plan is None else plan_of,
         summary=lambda state: (

@@ -11,8 +11,8 @@ from jaxil.learner.rewarder import AgentSpec, AgentView, Rewarder, Spec
 from jaxil.learner.state import LearnerParams, ModuleState, init_module
 from jaxil.maths import stacking
 from jaxil.maths.types import (
+    AnyEpisode,
     Batch,
-    Episode,
     ExpertBatch,
     ExpertEpisodes,
     Metrics,
@@ -120,7 +120,7 @@ def make_rewarder(
     def rewards(
         state: ModuleState,
         learner: LearnerParams,
-        episode: Episode,
+        episode: AnyEpisode,
         expert_episodes: ExpertEpisodes | None,
     ) -> Array:
         # For the log only: the agent learns from `relabel`.
@@ -135,6 +135,6 @@ def make_rewarder(
         init,
         update,
         expert_batch_size=batch_size,
-        ignores_later_frames=True,
+        ignores_padding=True,
         relabel=relabel,
     )

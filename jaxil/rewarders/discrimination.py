@@ -19,9 +19,9 @@ from jaxil.learner.state import (
 )
 from jaxil.maths import augmentation, losses, stacking
 from jaxil.maths.types import (
+    AnyEpisode,
     Batch,
     Data,
-    Episode,
     ExpertBatch,
     ExpertEpisodes,
     Metrics,
@@ -189,7 +189,7 @@ def make_transition_rewarder(
     def rewards(
         state: ModuleState,
         learner: LearnerParams,
-        episode: Episode,
+        episode: AnyEpisode,
         expert_episodes: ExpertEpisodes | None,
     ) -> Array:
         del expert_episodes
@@ -218,7 +218,7 @@ def make_transition_rewarder(
         update,
         expert_batch_size=batch_size,
         samples_successors=True,
-        ignores_later_frames=True,
+        ignores_padding=True,
         relabel=relabel if relabels else None,
         rewards_changed=None if relabels else lambda state: True,
     )

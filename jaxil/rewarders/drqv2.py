@@ -5,7 +5,7 @@ from jax import Array
 from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, Rewarder, RewarderState
 from jaxil.learner.state import LearnerParams
-from jaxil.maths.types import Episode, ExpertEpisodes
+from jaxil.maths.types import AnyEpisode, ExpertEpisodes
 
 METHOD = methods.Method(
     name="drqv2",
@@ -24,10 +24,10 @@ def make_rewarder(agent: AgentSpec) -> Rewarder:
     def rewards(
         state: RewarderState,
         learner: LearnerParams,
-        episode: Episode,
+        episode: AnyEpisode,
         expert_episodes: ExpertEpisodes | None,
     ) -> Array:
         del state, learner, expert_episodes
         return episode.rewards
 
-    return Rewarder(rewards, ignores_later_frames=True)
+    return Rewarder(rewards, ignores_padding=True)

@@ -1,5 +1,6 @@
 """Which moments of two episodes are paired, and the rewards of that pairing."""
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -18,42 +19,51 @@ class Matching(NamedTuple):
 
     Attributes:
       cost: features [T, D] and [N, D] to costs [T, N].
-      plan: costs [T, N] and masses of the expert's moments [N] to a plan [T, N], each
-        row of which has mass 1/T.
+      plan: costs [T, N] and masses of the agent's moments [T] and the expert's [N] to a
+        plan [T, N], whose rows have exactly the agent's masses.
     """
 
     cost: Callable[[Array, Array], Array]
-    plan: Callable[[Array, Array], Array]
+    plan: Callable[[Array, Array, Array], Array]
 
-    def rewards(self, agent: Array, experts: Array, num_moments: Array) -> Array:
+    def rewards(
+        self, agent: Array, agent_moments: Array, experts: Array, expert_moments: Array
+    ) -> Array:
         """Returns rewards towards the demonstration that is cheapest to reach.
 
         Args:
           agent: features of an episode. Shape [T, D].
+          agent_moments: how many of its T are not padding. Shape [].
           experts: features of the demonstrations. Shape [K, N, D].
-          num_moments: how many of a demonstration's N are not padding. Shape [K].
+          expert_moments: how many of a demonstration's N are not padding. Shape [K].
 
         Returns:
-          Rewards of the agent's T observations, see `closest_rewards`. Shape [T].
+          Rewards of the agent's observations, see `closest_rewards`; 0 for padding.
+          Shape [T].
         """
-        return closest_rewards(*self._costs_and_plans(agent, experts, num_moments))
+        pairs = self._costs_and_plans(agent, agent_moments, experts, expert_moments)
+        return closest_rewards(*pairs)
 
     def closest_plan(
-        self, agent: Array, experts: Array, num_moments: Array
+        self, agent: Array, agent_moments: Array, experts: Array, expert_moments: Array
     ) -> tuple[Array, Array]:
         """Returns the plan behind `rewards`, [T, N], and its demonstration's index."""
-        return cheapest(*self._costs_and_plans(agent, experts, num_moments))
+        pairs = self._costs_and_plans(agent, agent_moments, experts, expert_moments)
+        return cheapest(*pairs)
 
     def _costs_and_plans(
-        self, agent: Array, experts: Array, num_moments: Array
+        self, agent: Array, agent_moments: Array, experts: Array, expert_moments: Array
     ) -> tuple[Array, Array]:
-        chex.assert_rank([agent, experts, num_moments], [2, 3, 1])
-        chex.assert_equal_shape_prefix([experts, num_moments], 1)
-        costs = jax.vmap(self.cost, in_axes=(None, 0))(agent, experts)
-        masses = jax.vmap(transport.uniform_mass, in_axes=(0, None))(
-            num_moments, experts.shape[1]
-        )
-        return costs, jax.vmap(self.plan)(costs, masses)
+        chex.assert_rank([agent, experts, expert_moments], [2, 3, 1])
+        chex.assert_equal_shape_prefix([experts, expert_moments], 1)
+        agent_mass = transport.uniform_mass(agent_moments, len(agent))
+
+        def match(expert: Array, num_moments: Array) -> tuple[Array, Array]:
+            cost = self.cost(agent, expert)
+            expert_mass = transport.uniform_mass(num_moments, len(expert))
+            return cost, self.plan(cost, agent_mass, expert_mass)
+
+        return jax.vmap(match)(experts, expert_moments)
 
 
 def cheapest(costs: Array, plans: Array) -> tuple[Array, Array]:
@@ -118,11 +128,9 @@ def make_matching(
     Source: Cohen et al. 2021, sec. 3.1, and fig. 7 for what is not P-SIL's own.
     """
 
-    def sinkhorn(cost: Array, expert_mass: Array) -> Array:
-        return transport.sinkhorn_plan(
-            cost, expert_mass, epsilon=epsilon, num_iterations=num_iterations
-        )
-
+    sinkhorn = functools.partial(
+        transport.sinkhorn_plan, epsilon=epsilon, num_iterations=num_iterations
+    )
     costs = {
         "cosine": transport.cosine_cost,
         "euclidean": transport.euclidean_cost,

@@ -58,13 +58,18 @@ def make_rewarder(
     have to be covered.
     """
 
-    def compare(agent: Array, experts: Array, num_moments: Array) -> Array:
-        def rewards(expert: Array, length: Array) -> Array:
-            chosen = expert[waypoints(length, num_waypoints)]
-            cost = transport.cosine_cost(agent, chosen)
-            return coverage_rewards(cost, temperature=temperature)
+    def compare(
+        agent: Array, agent_moments: Array, experts: Array, expert_moments: Array
+    ) -> Array:
+        own = jnp.arange(len(agent)) < agent_moments
 
-        candidates = jax.vmap(rewards)(experts, num_moments)
+        def rewards(expert: Array, num_moments: Array) -> Array:
+            chosen = expert[waypoints(num_moments, num_waypoints)]
+            cost = transport.cosine_cost(agent, chosen)
+            covered = coverage_rewards(cost, temperature=temperature)
+            return jnp.where(own, covered, 0.0)
+
+        candidates = jax.vmap(rewards)(experts, expert_moments)
         return candidates[jnp.argmax(jnp.sum(candidates, axis=1))]
 
     return make_target_rewarder(

@@ -9,7 +9,7 @@ from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, AgentView, Rewarder, Spec
 from jaxil.learner.state import LearnerParams, ModuleState
 from jaxil.maths import stacking
-from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes, Metrics, Params
+from jaxil.maths.types import AnyEpisode, ExpertBatch, ExpertEpisodes, Metrics, Params
 from jaxil.networks.agent import apply
 from jaxil.networks.discriminator import PatchDiscriminator
 from jaxil.rewarders.discrimination import (
@@ -170,7 +170,7 @@ def make_rewarder(
     def observe(
         state: SimilarityState,
         learner: LearnerParams,
-        episode: Episode,
+        episode: AnyEpisode,
         expert_episodes: ExpertEpisodes | None,
     ) -> SimilarityState:
         del learner, expert_episodes

@@ -12,7 +12,7 @@ from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, AgentView, Rewarder, Spec
 from jaxil.learner.state import LearnerParams, ModuleState, init_module
 from jaxil.maths import augmentation, stacking
-from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes, Metrics, Params
+from jaxil.maths.types import AnyEpisode, ExpertBatch, ExpertEpisodes, Metrics, Params
 from jaxil.networks.agent import apply, critic_features
 from jaxil.networks.discriminator import Discriminator
 from jaxil.networks.encoder import PixelEncoder
@@ -110,7 +110,7 @@ def make_rewarder(
     def observe(
         state: JudgeState,
         learner: LearnerParams,
-        episode: Episode,
+        episode: AnyEpisode,
         expert_episodes: ExpertEpisodes | None,
     ) -> JudgeState:
         del learner
@@ -167,7 +167,7 @@ def make_rewarder(
     def rewards(
         state: JudgeState,
         learner: LearnerParams,
-        episode: Episode,
+        episode: AnyEpisode,
         expert_episodes: ExpertEpisodes | None,
     ) -> Array:
         del expert_episodes
@@ -183,6 +183,6 @@ def make_rewarder(
         observe,
         expert_batch_size=batch_size,
         matches_episodes=bool(num_components),
-        ignores_later_frames=True,
+        ignores_padding=True,
         rewards_changed=lambda state: True,
     )

@@ -29,7 +29,7 @@ from jaxil.learner.state import (
 )
 from jaxil.maths import augmentation, cloning
 from jaxil.maths.types import (
-    Episode,
+    AnyEpisode,
     ExpertBatch,
     ExpertEpisodes,
     Metrics,
@@ -213,7 +213,7 @@ def with_cloning(
     def observe(
         state: CloningState,
         learner: LearnerParams,
-        episode: Episode,
+        episode: AnyEpisode,
         expert_episodes: ExpertEpisodes | None,
     ) -> CloningState:
         inner = rewarder.observe(state.inner, learner, episode, expert_episodes)
@@ -233,7 +233,7 @@ def with_cloning(
         expert_batch_size=expert_batch_size,
         matches_episodes=rewarder.matches_episodes,
         samples_successors=True,
-        ignores_later_frames=rewarder.ignores_later_frames,
+        ignores_padding=rewarder.ignores_padding,
         relabel=of_inner(rewarder.relabel),
         rewards_changed=of_inner(rewarder.rewards_changed),
         actor_loss=actor_loss,

@@ -16,7 +16,7 @@ from jaxil.learner.state import (
     init_module,
 )
 from jaxil.maths import stacking, transport
-from jaxil.maths.types import Episode, ExpertBatch, ExpertEpisodes, Metrics, Params
+from jaxil.maths.types import AnyEpisode, ExpertBatch, ExpertEpisodes, Metrics, Params
 from jaxil.networks.agent import apply
 from jaxil.networks.discriminator import Embedding
 from jaxil.rewarders.matching import (
@@ -123,26 +123,29 @@ def make_rewarder(
         )
         return state, {"sinkhorn/distance": -value}
 
-    def features(
-        state: SilState, episode: Episode, expert_episodes: ExpertEpisodes
-    ) -> tuple[Array, Array]:
+    def features_and_moments(
+        state: SilState, episode: AnyEpisode, expert_episodes: ExpertEpisodes
+    ) -> tuple[Array, Array, Array, Array]:
         params = state.embedding.params
-        # One demonstration at a time: all at once would need gigabytes.
-        experts = jax.lax.map(lambda f: embed(params, f), expert_episodes.frames)
-        return embed(params, episode.frames), experts
+        return (
+            embed(params, jnp.asarray(episode.frames)),
+            jnp.asarray(episode.num_steps) + 1,
+            # One demonstration at a time: all at once would need gigabytes.
+            jax.lax.map(lambda f: embed(params, f), expert_episodes.frames),
+            jnp.asarray(expert_episodes.num_frames),
+        )
 
     def unscaled(
-        state: SilState, episode: Episode, expert_episodes: ExpertEpisodes | None
+        state: SilState, episode: AnyEpisode, expert_episodes: ExpertEpisodes | None
     ) -> Array:
         assert expert_episodes is not None
-        mine, experts = features(state, episode, expert_episodes)
-        # Reward t is that of o_{t+1}.
-        return matching.rewards(mine, experts, expert_episodes.num_frames)[1:]
+        compared = features_and_moments(state, episode, expert_episodes)
+        return matching.rewards(*compared)[1:]  # reward t is that of o_{t+1}
 
     def observe(
         state: SilState,
         learner: LearnerParams,
-        episode: Episode,
+        episode: AnyEpisode,
         expert_episodes: ExpertEpisodes | None,
     ) -> SilState:
         del learner
@@ -156,7 +159,7 @@ def make_rewarder(
     def rewards(
         state: SilState,
         learner: LearnerParams,
-        episode: Episode,
+        episode: AnyEpisode,
         expert_episodes: ExpertEpisodes | None,
     ) -> Array:
         del learner
@@ -165,12 +168,12 @@ def make_rewarder(
     def plan(
         state: SilState,
         learner: LearnerParams,
-        episode: Episode,
+        episode: AnyEpisode,
         expert_episodes: ExpertEpisodes,
     ) -> tuple[Array, Array]:
         del learner
-        mine, experts = features(state, episode, expert_episodes)
-        return matching.closest_plan(mine, experts, expert_episodes.num_frames)
+        compared = features_and_moments(state, episode, expert_episodes)
+        return matching.closest_plan(*compared)
 
     return Rewarder(
         rewards,
@@ -179,6 +182,7 @@ def make_rewarder(
         observe,
         expert_batch_size=batch_size,
         matches_episodes=True,
+        ignores_padding=True,
         summary=lambda state: {"sinkhorn/scale": state.scale},
         rewards_changed=lambda state: True,
         plan=plan,
@@ -200,6 +204,9 @@ def batch_distance(matching: Matching, agent: Array, expert: Array) -> Array:
     """
     chex.assert_rank([agent, expert], 2)
     cost = matching.cost(agent, expert)
-    mass = transport.uniform_mass(jnp.asarray(len(expert)), len(expert))
-    plan = matching.plan(jax.lax.stop_gradient(cost), mass)
+    masses = (
+        transport.uniform_mass(jnp.asarray(len(batch)), len(batch))
+        for batch in (agent, expert)
+    )
+    plan = matching.plan(jax.lax.stop_gradient(cost), *masses)
     return jnp.sum(cost * jax.lax.stop_gradient(plan))

@@ -8,7 +8,7 @@ from jax import Array
 from jaxil.learner.rewarder import AgentSpec, Rewarder, Spec
 from jaxil.learner.state import LearnerParams, copy_params
 from jaxil.maths import stacking
-from jaxil.maths.types import Episode, ExpertEpisodes, Params
+from jaxil.maths.types import AnyEpisode, ExpertEpisodes, Params
 from jaxil.networks.agent import actor_features
 from jaxil.rewarders.comparison import Compare, make_comparing_rewarder
 
@@ -89,10 +89,10 @@ def make_target_rewarder(
     def update_features(
         state: TargetState,
         learner: LearnerParams,
-        episode: Episode,
+        episode: AnyEpisode,
         expert_episodes: ExpertEpisodes,
     ) -> TargetState:
-        num_steps = jnp.asarray(episode.actions.shape[0], jnp.int32)
+        num_steps = jnp.asarray(episode.num_steps, jnp.int32)
         state = state.replace(steps_since_copy=state.steps_since_copy + num_steps)
         return jax.lax.cond(
             state.steps_since_copy >= target_update_steps,

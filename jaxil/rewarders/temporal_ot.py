@@ -67,26 +67,35 @@ def make_rewarder(
     Reward, on the features of P-SIL; the paper's are those of a frozen ResNet.
     """
 
-    def match(agent: Array, experts: Array, num_moments: Array) -> tuple[Array, Array]:
-        def match_one(expert: Array, length: Array) -> tuple[Array, Array]:
-            cost = transport.cosine_cost(agent, expert)
-            cost = context_cost(cost, length, context_length=context_length)
+    def match(
+        agent: Array, agent_moments: Array, experts: Array, expert_moments: Array
+    ) -> tuple[Array, Array]:
+        agent_mass = transport.uniform_mass(agent_moments, len(agent))
+
+        def match_one(expert: Array, num_moments: Array) -> tuple[Array, Array]:
+            cost = context_cost(
+                transport.cosine_cost(agent, expert),
+                agent_moments,
+                num_moments,
+                context_length=context_length,
+            )
             plan = band_plan(
                 cost,
-                transport.uniform_mass(length, len(expert)),
+                agent_mass,
+                transport.uniform_mass(num_moments, len(expert)),
                 band_steps=band_steps,
                 epsilon=epsilon,
                 num_iterations=num_iterations,
             )
             return cost, plan
 
-        return jax.vmap(match_one)(experts, num_moments)
+        return jax.vmap(match_one)(experts, expert_moments)
 
-    def rewards(agent: Array, experts: Array, num_moments: Array) -> Array:
-        return closest_rewards(*match(agent, experts, num_moments))
+    def rewards(*features_and_moments: Array) -> Array:
+        return closest_rewards(*match(*features_and_moments))
 
-    def plan(agent: Array, experts: Array, num_moments: Array) -> tuple[Array, Array]:
-        return cheapest(*match(agent, experts, num_moments))
+    def plan(*features_and_moments: Array) -> tuple[Array, Array]:
+        return cheapest(*match(*features_and_moments))
 
     return make_target_rewarder(
         agent,
@@ -97,7 +106,9 @@ def make_rewarder(
     )
 
 
-def context_cost(cost: Array, num_moments: Array, *, context_length: int) -> Array:
+def context_cost(
+    cost: Array, agent_moments: Array, expert_moments: Array, *, context_length: int
+) -> Array:
     """Averages costs over the moments that follow.
 
         C_tn = mean over k < context_length of c_{t+k, n+k}
@@ -106,7 +117,8 @@ def context_cost(cost: Array, num_moments: Array, *, context_length: int) -> Arr
 
     Args:
       cost: c, of pairs of single moments. Shape [T, N].
-      num_moments: how many of the expert's N are not padding. Shape [].
+      agent_moments: how many of the agent's T are not padding. Shape [].
+      expert_moments: how many of the expert's N are not padding. Shape [].
       context_length: pairs in a mean; 1 returns the costs themselves.
 
     Returns:
@@ -114,8 +126,9 @@ def context_cost(cost: Array, num_moments: Array, *, context_length: int) -> Arr
 
     Source: Fu et al. 2024, the context-aware cost; fuyw/TemporalOT.
     """
-    chex.assert_rank([cost, num_moments], [2, 0])
-    own = jnp.broadcast_to(jnp.arange(cost.shape[1])[None] < num_moments, cost.shape)
+    chex.assert_rank([cost, agent_moments, expert_moments], [2, 0, 0])
+    agent_time, expert_time = (jnp.arange(size) for size in cost.shape)
+    own = (agent_time < agent_moments)[:, None] & (expert_time < expert_moments)[None]
 
     def total(values: Array) -> Array:
         shifts = (
@@ -130,6 +143,7 @@ def context_cost(cost: Array, num_moments: Array, *, context_length: int) -> Arr
 
 def band_plan(
     cost: Array,
+    agent_mass: Array,
     expert_mass: Array,
     *,
     band_steps: int,
@@ -145,7 +159,8 @@ def band_plan(
 
     Args:
       cost: pairwise costs, of the size of cosine costs. Shape [T, N].
-      expert_mass: see `transport.sinkhorn_plan`. Shape [N].
+      agent_mass: see `transport.sinkhorn_plan`. Shape [T].
+      expert_mass: likewise. Shape [N].
       band_steps: half the band's width.
       epsilon: weight of the entropy, in units of cost; at most 1.
       num_iterations: Sinkhorn iterations; static under jit.
@@ -155,11 +170,12 @@ def band_plan(
 
     Source: Fu et al. 2024, the temporal mask; fuyw/TemporalOT.
     """
-    chex.assert_rank([cost, expert_mass], [2, 1])
+    chex.assert_rank([cost, agent_mass, expert_mass], [2, 1, 1])
     agent_time, expert_time = (jnp.arange(size) for size in cost.shape)
     inside = jnp.abs(agent_time[:, None] - expert_time[None]) <= band_steps
     return transport.sinkhorn_plan(
         jnp.where(inside, cost, _BLOCKED_COST),
+        agent_mass,
         expert_mass,
         epsilon=epsilon,
         num_iterations=num_iterations,

@@ -6,7 +6,7 @@ from jax import Array
 from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, Rewarder, RewarderState
 from jaxil.learner.state import LearnerParams
-from jaxil.maths.types import Episode, ExpertEpisodes
+from jaxil.maths.types import AnyEpisode, ExpertEpisodes
 
 METHOD = methods.Method(
     name="zero",
@@ -21,13 +21,13 @@ METHOD = methods.Method(
 def make_rewarder(agent: AgentSpec) -> Rewarder:
     """Returns a rewarder of zeros."""
     del agent
-    return Rewarder(zero_rewards, ignores_later_frames=True)
+    return Rewarder(zero_rewards, ignores_padding=True)
 
 
 def zero_rewards(
     state: RewarderState,
     learner: LearnerParams,
-    episode: Episode,
+    episode: AnyEpisode,
     expert_episodes: ExpertEpisodes | None,
 ) -> Array:
     """Returns zeros [T]."""

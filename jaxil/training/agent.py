@@ -30,7 +30,7 @@ from jaxil.learner.update import (
     init_train_state,
     make_update_step,
 )
-from jaxil.maths.types import Episode, ExpertEpisodes
+from jaxil.maths.types import Episode, ExpertEpisodes, PaddedEpisode
 from jaxil.native import build, encoding
 from jaxil.networks.agent import AgentNetworks, make_agent_networks
 from jaxil.training import lengths
@@ -48,8 +48,8 @@ class Agent(NamedTuple):
       observe: the rewarder's.
       rewards: (rewarder state, learner, episode, expert episodes) -> the rewarder's
         rewards, a NumPy array [T].
-      compiled_length: (T) -> the length for which `rewards` and `refresh` of an episode
-        of T steps are compiled.
+      compiled_length: (T) -> the length for which `observe`, `rewards` and `refresh` of
+        an episode of T steps are compiled.
       refresh: rewards of stored episodes as of now, see `rewarder.make_refresh`.
       plan: the rewarder's; None where it has none.
       rewarder: the method itself.
@@ -255,16 +255,22 @@ def make_agent(
     usual_steps = environment.episode_steps
 
     def compiled_length(num_steps: int) -> int:
-        if not rewarder.ignores_later_frames:
+        if not rewarder.ignores_padding:
             return num_steps
         return lengths.padded_length(num_steps, usual_steps)
 
+    def pad(episode: Episode) -> PaddedEpisode:
+        return lengths.pad_episode(episode, compiled_length(episode.num_steps))
+
+    compiled_observe = jax.jit(rewarder.observe)
     compiled_rewards = jax.jit(rewarder.rewards)
 
+    def observe(state: Any, params: Any, episode: Episode, experts: Any) -> Any:
+        return compiled_observe(state, params, pad(episode), experts)
+
     def rewards(state: Any, params: Any, episode: Episode, experts: Any) -> np.ndarray:
-        num_steps = len(episode.actions)
-        padded = lengths.pad_episode(episode, compiled_length(num_steps))
-        return np.asarray(compiled_rewards(state, params, padded, experts))[:num_steps]
+        found = compiled_rewards(state, params, pad(episode), experts)
+        return np.asarray(found)[: episode.num_steps]
 
     def init_state() -> TrainState:
         key = jax.random.key(config.seed)
@@ -279,7 +285,7 @@ def make_agent(
             make_sample_action(networks, exploration_schedule(config))
         ),
         mean_action=jax.jit(make_mean_action(networks)),
-        observe=jax.jit(rewarder.observe),
+        observe=observe,
         rewards=rewards,
         compiled_length=compiled_length,
         refresh=jax.jit(make_refresh(rewarder)),

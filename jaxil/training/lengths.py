@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxil.maths.types import Episode
+from jaxil.maths.types import Episode, PaddedEpisode
 
 _SMALLEST = 8
 
@@ -37,9 +37,11 @@ def pad_rows(values: Any, num_rows: int) -> np.ndarray:
     return np.concatenate([values, np.repeat(values[-1:], missing, axis=0)])
 
 
-def pad_episode(episode: Episode, num_steps: int) -> Episode:
-    """Repeats an episode's last frame, action, reward and discount."""
-    return Episode(
-        pad_rows(episode.frames, num_steps + 1),
-        *(pad_rows(values, num_steps) for values in episode[1:]),
+def pad_episode(episode: Episode, length: int) -> PaddedEpisode:
+    """Repeats an episode's last frame, action, reward and discount, up to a length."""
+    frames, *others = episode
+    return PaddedEpisode(
+        pad_rows(frames, length + 1),
+        *(pad_rows(values, length) for values in others),
+        num_steps=np.int32(episode.num_steps),
     )

@@ -129,6 +129,7 @@ class Updates:
         replay = self._replay
         slots = np.stack([pad_rows(replay.slots(i), length + 1) for i in indices])
         actions = np.stack([pad_rows(replay.actions(i), length) for i in indices])
+        num_steps = np.array([len(replay.slots(i)) - 1 for i in indices], np.int32)
         if self._device_copy is not None:
             frames = self._device_copy.frames
         else:
@@ -140,6 +141,7 @@ class Updates:
             frames,
             slots.astype(np.int32),
             actions,
+            num_steps,
             self._experts,
         )
         return np.asarray(rewards)

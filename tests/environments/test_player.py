@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxil.environments.player import InProcess, Player
+from jaxil.errors import EnvironmentsFailed
 from tests.environments.counting import Counting, InTurn
 
 _LENGTHS = st.lists(st.integers(1, 5), min_size=6, max_size=6)
@@ -173,3 +174,20 @@ def test_one_environment_of_this_process_steps_when_it_is_waited_for():
     assert single.receive(0).discount == pytest.approx(0.5)
     single.step(0, np.zeros(1))
     assert single.receive(0).is_last
+
+
+def test_an_error_of_the_task_in_mid_episode_says_what_and_where():
+    environment = Counting(3)
+
+    def step(action):
+        raise FloatingPointError("the arm broke off")
+
+    environment.step = step
+    player = Player(InProcess(environment), first_episode=0)
+    assert player.begin(lambda _: True)
+    player.step(np.zeros((1, 1)))
+    with pytest.raises(EnvironmentsFailed) as caught:
+        player.observe()
+    said = str(caught.value)
+    assert "raised an error in mid-episode: FloatingPointError: the arm broke" in said
+    assert "(test_player.py, line " in said

@@ -17,8 +17,9 @@ import numpy as np
 import pytest
 
 from jaxil.environments.player import InProcess, Player
-from jaxil.environments.pool import EnvironmentsFailed, Pool
+from jaxil.environments.pool import Pool
 from jaxil.environments.suite import make_environment
+from jaxil.errors import EnvironmentsFailed
 from tests.processes import is_alive, wait_until_gone
 
 ROOT = pathlib.Path(__file__).parent.parent.parent

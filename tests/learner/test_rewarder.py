@@ -93,7 +93,8 @@ def test_refreshed_rewards_are_those_that_each_episode_would_get_now(method):
     slots = np.stack([replay.slots(index) for index in replay.episodes])
     actions = np.stack([replay.actions(index) for index in replay.episodes])
     assert len(slots) == 3
-    refreshed = refresh(method)(state, PARAMS, replay.frames, slots, actions, experts)
+    stored = (actions, np.full(3, STEPS), experts)
+    refreshed = refresh(method)(state, PARAMS, replay.frames, slots, *stored)
     for index, rewards in zip(replay.episodes, np.asarray(refreshed), strict=True):
         episode = replay.episode(index)
         expected = make_rewarder(method).rewards(state, PARAMS, episode, experts)
@@ -104,20 +105,23 @@ def test_refreshed_rewards_are_those_that_each_episode_would_get_now(method):
     # From a copy on the host that holds these episodes' frames alone, one by one.
     frames = replay.frames[slots.ravel()]
     indices = np.arange(slots.size).reshape(slots.shape)
-    copied = refresh(method)(state, PARAMS, frames, indices, actions, experts)
+    copied = refresh(method)(state, PARAMS, frames, indices, *stored)
     np.testing.assert_allclose(copied, refreshed, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("frames", "indices", "actions"),
+    ("frames", "indices", "actions", "num_steps"),
     [
-        ((8, SIDE, SIDE, 3), (2, STEPS), (2, STEPS, 2)),  # no last observation
-        ((8, SIDE, SIDE, 3), (2, STEPS + 1), (3, STEPS, 2)),  # an episode more
-        ((8, SIDE, SIDE, 3), (STEPS + 1,), (STEPS, 2)),  # one episode alone
-        ((2, STEPS + 1, SIDE, SIDE, 3), (2, STEPS + 1), (2, STEPS, 2)),
+        ((8, SIDE, SIDE, 3), (2, STEPS), (2, STEPS, 2), 2),  # no last observation
+        ((8, SIDE, SIDE, 3), (2, STEPS + 1), (3, STEPS, 2), 2),  # an episode more
+        ((8, SIDE, SIDE, 3), (2, STEPS + 1), (2, STEPS, 2), 3),  # a number more
+        ((8, SIDE, SIDE, 3), (STEPS + 1,), (STEPS, 2), 1),  # one episode alone
+        ((2, STEPS + 1, SIDE, SIDE, 3), (2, STEPS + 1), (2, STEPS, 2), 2),
     ],
 )
-def test_refuses_shapes_that_do_not_belong_together(frames, indices, actions):
+def test_refuses_shapes_that_do_not_belong_together(
+    frames, indices, actions, num_steps
+):
     with pytest.raises(AssertionError):
         make_refresh(make_rewarder("pdac"))(
             None,
@@ -125,5 +129,6 @@ def test_refuses_shapes_that_do_not_belong_together(frames, indices, actions):
             np.zeros(frames, np.uint8),
             np.zeros(indices, np.int32),
             np.zeros(actions, np.float32),
+            np.full(num_steps, STEPS),
             None,
         )

@@ -17,10 +17,9 @@ from jaxil.maths import transport
 
 
 def plan_of(cost, *, epsilon=0.1, num_iterations=200):
-    length = cost.shape[-1]
-    mass = transport.uniform_mass(jnp.asarray(length), length)
+    masses = (transport.uniform_mass(jnp.asarray(n), n) for n in cost.shape)
     return transport.sinkhorn_plan(
-        cost, mass, epsilon=epsilon, num_iterations=num_iterations
+        cost, *masses, epsilon=epsilon, num_iterations=num_iterations
     )
 
 
@@ -116,7 +115,13 @@ class SinkhornPlanTest(chex.TestCase):
 
     def test_rejects_a_batch_of_costs(self):
         with pytest.raises(AssertionError):
-            solve(jnp.zeros((2, 3, 3)))
+            transport.sinkhorn_plan(
+                jnp.zeros((2, 3, 3)),
+                jnp.full(3, 1 / 3),
+                jnp.full(3, 1 / 3),
+                epsilon=0.1,
+                num_iterations=1,
+            )
 
 
 class TransportRewardsTest(chex.TestCase):

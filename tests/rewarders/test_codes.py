@@ -8,6 +8,7 @@ import pytest
 from jaxil.maths import stacking
 from jaxil.maths.types import ExpertEpisodes
 from jaxil.rewarders import codes
+from jaxil.training.lengths import pad_episode
 from tests.tiny_agent import make_episode, random_frames
 
 STACK, COMPONENTS, SIDE = 3, 4, 12
@@ -44,6 +45,18 @@ def test_padding_of_short_demonstrations_is_not_read():
     plays = make_episode(random_frames(1, 20))
     first, second = (observe(empty(), plays, each) for each in (experts(), padded))
     jax.tree.map(np.testing.assert_array_equal, first, second)
+
+
+def test_nor_is_padding_of_short_episodes():
+    play = random_frames(1, 20)
+    expected = observe(empty(), make_episode(play), experts())
+    padded = pad_episode(make_episode(play), 23)
+    padded.frames[20:] = 255
+    code = observe(empty(), padded, experts())
+    assert code.num_rows == expected.num_rows
+    np.testing.assert_allclose(
+        np.abs(code.sketch), np.abs(expected.sketch), rtol=1e-3, atol=1e-3
+    )
 
 
 def test_components_are_those_of_demonstrations_and_play():

@@ -68,14 +68,14 @@ def first_rewards(params, frames, experts=EXPERTS, frame_stack=1, spec=SPEC):
 @functools.partial(jax.jit, static_argnames=("epsilon", "num_iterations"))
 def solve(costs, *, epsilon, num_iterations):
     """Rewards to demonstrations of one length."""
-    masses = jnp.full((costs.shape[0], costs.shape[2]), 1.0 / costs.shape[2])
+    masses = [jnp.full(size, 1.0 / size) for size in costs.shape[1:]]
     matching = make_matching(
         cost="cosine",
         alignment="transport",
         epsilon=epsilon,
         num_iterations=num_iterations,
     )
-    return closest_rewards(costs, jax.vmap(matching.plan)(costs, masses))
+    return closest_rewards(costs, jax.vmap(lambda c: matching.plan(c, *masses))(costs))
 
 
 # The transport -----------------------------------------------------------------
@@ -150,8 +150,8 @@ def test_rewards_step_by_step(frame_stack):
         cost = transport.cosine_cost(
             features(jnp.asarray(frames)), features(jnp.asarray(demonstration))
         )
-        mass = jnp.full(EXPERT_STEPS + 1, 1.0 / (EXPERT_STEPS + 1))
-        plan = transport.sinkhorn_plan(cost, mass, epsilon=0.01, num_iterations=50)
+        masses = (jnp.full(n + 1, 1.0 / (n + 1)) for n in (STEPS, EXPERT_STEPS))
+        plan = transport.sinkhorn_plan(cost, *masses, epsilon=0.01, num_iterations=50)
         candidates.append(-np.sum(np.asarray(cost) * np.asarray(plan), axis=1))
     best = max(candidates, key=np.sum)[1:]
     rewards = first_rewards(params, frames, EXPERTS, frame_stack)

@@ -54,6 +54,7 @@ def test_rewards_are_those_of_the_codes():
 
     rewards = make_matching(**MATCHING).rewards(
         code(jnp.asarray(episode.frames)),
+        jnp.array(STEPS + 1),
         jnp.stack([code(jnp.asarray(frames)) for frames in EXPERTS.frames]),
         EXPERTS.num_frames,
     )

@@ -61,56 +61,57 @@ def rewards_after_the_first(rewarder, frames=None):
     return np.asarray(rewards)
 
 
+def masses_of(cost):
+    return [transport.uniform_mass(jnp.array(size), size) for size in cost.shape]
+
+
 def test_context_cost_by_hand():
     cost = jnp.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.0]])
-    averaged = temporal_ot.context_cost(cost, jnp.array(3), context_length=2)
+    three = jnp.array(3)
+    averaged = temporal_ot.context_cost(cost, three, three, context_length=2)
     # (1 + 5) / 2, (2 + 6) / 2, 3 alone, and so on; the last row stands alone.
     np.testing.assert_allclose(averaged, [[3, 4, 3], [6, 7, 6], [7, 8, 9]])
     # Longer than the episode: whole diagonals.
-    averaged = temporal_ot.context_cost(cost, jnp.array(3), context_length=5)
+    averaged = temporal_ot.context_cost(cost, three, three, context_length=5)
     np.testing.assert_allclose(averaged, [[5, 4, 3], [6, 7, 6], [7, 8, 9]])
 
 
-def test_the_padding_of_a_short_demonstration_is_no_context():
-    cost = random_cost(0, 5, 6)
-    padded = temporal_ot.context_cost(jnp.asarray(cost), jnp.array(4), context_length=3)
-    alone = temporal_ot.context_cost(
-        jnp.asarray(cost[:, :4]), jnp.array(4), context_length=3
-    )
-    np.testing.assert_allclose(padded[:, :4], alone, rtol=1e-6)
+def test_padding_is_no_context():
+    cost = jnp.asarray(random_cost(0, 7, 6))
+    own = jnp.array(5), jnp.array(4)
+    padded = temporal_ot.context_cost(cost, *own, context_length=3)
+    alone = temporal_ot.context_cost(cost[:5, :4], *own, context_length=3)
+    np.testing.assert_allclose(padded[:5, :4], alone, rtol=1e-6)
+    assert np.all(padded[5:] == 0.0)
     assert np.all(padded[:, 4:] == 0.0)
 
 
 @pytest.mark.parametrize("shape", [(8, 8), (6, 8)])
 def test_no_mass_moves_outside_the_band(shape):
     cost = jnp.asarray(random_cost(1, *shape))
-    mass = transport.uniform_mass(jnp.array(shape[1]), shape[1])
+    masses = masses_of(cost)
     plan = temporal_ot.band_plan(
-        cost, mass, band_steps=2, epsilon=0.05, num_iterations=300
+        cost, *masses, band_steps=2, epsilon=0.05, num_iterations=300
     )
     away = np.abs(np.subtract.outer(np.arange(shape[0]), np.arange(shape[1])))
     assert np.all(plan[away > 2] == 0.0)
     assert np.all(plan[away == 2] >= 0.0)
     np.testing.assert_allclose(np.sum(plan, axis=1), 1 / shape[0], rtol=1e-4)
-    np.testing.assert_allclose(np.sum(plan, axis=0), mass, atol=2e-3)
+    np.testing.assert_allclose(np.sum(plan, axis=0), masses[1], atol=2e-3)
 
 
 def test_a_band_of_no_width_pairs_equal_times():
+    cost = jnp.asarray(random_cost(2, 5, 5))
     plan = temporal_ot.band_plan(
-        jnp.asarray(random_cost(2, 5, 5)),
-        transport.uniform_mass(jnp.array(5), 5),
-        band_steps=0,
-        epsilon=0.01,
-        num_iterations=10,
+        cost, *masses_of(cost), band_steps=0, epsilon=0.01, num_iterations=10
     )
     np.testing.assert_allclose(plan, np.eye(5) / 5, rtol=1e-5)
 
 
 def test_a_much_longer_episode_still_gets_finite_rewards():
     cost = jnp.asarray(random_cost(3, 9, 4))
-    mass = transport.uniform_mass(jnp.array(4), 4)
     plan = temporal_ot.band_plan(
-        cost, mass, band_steps=1, epsilon=0.01, num_iterations=100
+        cost, *masses_of(cost), band_steps=1, epsilon=0.01, num_iterations=100
     )
     np.testing.assert_allclose(np.sum(plan, axis=1), 1 / 9, rtol=1e-2)
 

@@ -1,7 +1,8 @@
-"""Episodes of any length get the rewards that they would get without padding."""
+"""Episodes of any length are rewarded as they would be without padding."""
 
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given
@@ -70,12 +71,16 @@ def test_rewards_of_transitions_do_not_depend_on_what_follows(method):
     assert np.ptp(whole) > 0 or method in _CONSTANT
 
 
+def matching_agent(config):
+    drawing, demonstrations = Drawing(), make_demonstrations()
+    agent = agents.make_agent(config, drawing, demonstrations)  # pyright: ignore
+    return agent, agents.expert_episodes(agent.rewarder, demonstrations)
+
+
 def test_nor_do_rewards_of_components():
     config = make_config("pdac")
     config.discriminator.num_components = 4
-    drawing, demonstrations = Drawing(), make_demonstrations()
-    agent = agents.make_agent(config, drawing, demonstrations)  # pyright: ignore
-    experts = agents.expert_episodes(agent.rewarder, demonstrations)
+    agent, experts = matching_agent(config)
     episode, state = draw_episode(STEPS), agent.init_state()
     rewarder = agent.observe(state.rewarder, state.params, episode, experts)
     whole = agent.rewards(rewarder, state.params, episode, experts)
@@ -84,25 +89,57 @@ def test_nor_do_rewards_of_components():
     assert np.ptp(whole) > 0
 
 
-def test_methods_that_compare_whole_episodes_get_them_as_they_are():
-    for method in _MATCHING:
-        assert make_agent(method).compiled_length(9) == 9
+def without_padding(agent, function, state, *arguments):
+    """What the method itself returns for an episode as it is."""
+    rewarder = getattr(agent.rewarder, function)
+    return jax.jit(rewarder)(state.rewarder, state.params, *arguments)
+
+
+@pytest.mark.parametrize(
+    ("method", "settings"),
+    [
+        *((method, {}) for method in sorted(_MATCHING)),
+        ("psil", {"sinkhorn": {"alignment": "time"}}),
+        ("psil", {"sinkhorn": {"num_components": 4}}),
+    ],
+)
+def test_comparisons_of_whole_episodes_do_not_see_the_padding(method, settings):
+    config = make_config(method, **settings)
+    agent, experts = matching_agent(config)
+    assert agent.compiled_length(9) == 12
+    state, episode = agent.init_state(), draw_episode(9)
+    expected = without_padding(agent, "observe", state, episode, experts)
+    observed = agent.observe(state.rewarder, state.params, episode, experts)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5),
+        observed,
+        expected,
+    )
+    state = state.replace(rewarder=observed)
+    rewards = agent.rewards(observed, state.params, episode, experts)
+    expected = without_padding(agent, "rewards", state, episode, experts)
+    assert rewards.shape == (9,)
+    assert np.ptp(rewards) > 0
+    np.testing.assert_allclose(rewards, expected, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("on_device", [False, True])
-def test_stored_episodes_of_all_lengths_are_rewarded_anew(on_device):
-    config = make_config("pdac", replay_on_device=on_device, replay_size_steps=100)
-    agent, demonstrations = make_agent("pdac"), make_demonstrations()
+@pytest.mark.parametrize("method", ["pdac", "psil"])
+def test_stored_episodes_of_all_lengths_are_rewarded_anew(method, on_device):
+    config = make_config(method, replay_on_device=on_device, replay_size_steps=100)
+    (agent, experts), demonstrations = matching_agent(config), make_demonstrations()
     drawing: Any = Drawing()
     replay = assembly.make_replay(config, drawing)
     episodes = [draw_episode(num_steps) for num_steps in (9, 5, 21, 10, 11, 12, 2)]
     for episode in episodes:
         replay.add_episode(**episode._asdict())
     state, before = agent.init_state(), agent.refresh._cache_size()
-    updates = Updates(config, agent, replay, demonstrations, None)
+    observed = agent.observe(state.rewarder, state.params, episodes[0], experts)
+    state = state.replace(rewarder=observed)
+    updates = Updates(config, agent, replay, demonstrations, experts)
     updates.refresh_rewards(state)
     for number, episode in enumerate(episodes):
-        expected = agent.rewards(state.rewarder, state.params, episode, None)
+        expected = agent.rewards(state.rewarder, state.params, episode, experts)
         stored = replay.rewards(number)
         np.testing.assert_allclose(stored, expected, rtol=1e-4, atol=1e-6)
     assert agent.refresh._cache_size() - before == 3  # of 8, 12 and 21 steps

@@ -62,6 +62,7 @@ def act_until(run, num_steps):
 def finished(run):
     run.loop()
     run.finish()
+    run.close()
     return run
 
 
