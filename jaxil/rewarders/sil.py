@@ -13,17 +13,15 @@ from jaxil.learner.state import (
     LearnerParams,
     ModuleState,
     apply_gradients,
+    copy_params,
     init_module,
 )
 from jaxil.maths import stacking, transport
 from jaxil.maths.types import AnyEpisode, ExpertBatch, ExpertEpisodes, Metrics, Params
 from jaxil.networks.agent import apply
 from jaxil.networks.discriminator import Embedding
-from jaxil.rewarders.matching import (
-    Matching,
-    make_matching,
-    scale_of_first_episode,
-)
+from jaxil.rewarders.comparison import make_comparing_rewarder
+from jaxil.rewarders.matching import Matching, make_matching
 
 METHOD = methods.Method(
     name="sil",
@@ -47,10 +45,15 @@ class SilState(struct.PyTreeNode):
 
     Attributes:
       embedding: the adversary.
+      compared: its parameters as of the last episode's end, under which episodes are
+        compared.
+      expert_features: demonstrations under these. Shape [K, N + 1, D].
       scale: factor on rewards, set by the first episode; 0 before. Shape [].
     """
 
     embedding: ModuleState
+    compared: Params
+    expert_features: Array
     scale: Array
 
 
@@ -71,8 +74,8 @@ def make_rewarder(
 
     The embedding f, with a separate encoder, is trained to maximise the Sinkhorn
     distance between a batch of the agent's observations and one of the expert's.
-    Rewards are as in P-SIL, but under the live f, without a target copy. Pixels are
-    not augmented.
+    Rewards are as in P-SIL, but under f as it is at each episode's end. Pixels are not
+    augmented.
 
     Args:
       agent: the embedding's encoder has the architecture of its encoder.
@@ -99,7 +102,13 @@ def make_rewarder(
     def init(key: Array, spec: Spec, learner: LearnerParams) -> SilState:
         del learner
         params = embedding.init(key, jnp.zeros((1, *spec.observation_shape)))
-        return SilState(init_module(params, optimiser), jnp.zeros(()))
+        shape = (spec.num_demonstrations, spec.expert_steps + 1, agent.feature_dim)
+        return SilState(
+            embedding=init_module(params, optimiser),
+            compared=copy_params(params),
+            expert_features=jnp.zeros(shape),
+            scale=jnp.zeros(()),
+        )
 
     def update(
         state: SilState,
@@ -123,70 +132,28 @@ def make_rewarder(
         )
         return state, {"sinkhorn/distance": -value}
 
-    def features_and_moments(
-        state: SilState, episode: AnyEpisode, expert_episodes: ExpertEpisodes
-    ) -> tuple[Array, Array, Array, Array]:
-        params = state.embedding.params
-        return (
-            embed(params, jnp.asarray(episode.frames)),
-            jnp.asarray(episode.num_steps) + 1,
-            # One demonstration at a time: all at once would need gigabytes.
-            jax.lax.map(lambda f: embed(params, f), expert_episodes.frames),
-            jnp.asarray(expert_episodes.num_frames),
-        )
-
-    def unscaled(
-        state: SilState, episode: AnyEpisode, expert_episodes: ExpertEpisodes | None
-    ) -> Array:
-        assert expert_episodes is not None
-        compared = features_and_moments(state, episode, expert_episodes)
-        return matching.rewards(*compared)[1:]  # reward t is that of o_{t+1}
-
-    def observe(
-        state: SilState,
-        learner: LearnerParams,
-        episode: AnyEpisode,
-        expert_episodes: ExpertEpisodes | None,
-    ) -> SilState:
-        del learner
-        scale = scale_of_first_episode(
-            state.scale,
-            lambda: unscaled(state, episode, expert_episodes),
-            return_scale,
-        )
-        return state.replace(scale=scale)
-
-    def rewards(
-        state: SilState,
-        learner: LearnerParams,
-        episode: AnyEpisode,
-        expert_episodes: ExpertEpisodes | None,
-    ) -> Array:
-        del learner
-        return state.scale * unscaled(state, episode, expert_episodes)
-
-    def plan(
+    def update_features(
         state: SilState,
         learner: LearnerParams,
         episode: AnyEpisode,
         expert_episodes: ExpertEpisodes,
-    ) -> tuple[Array, Array]:
-        del learner
-        compared = features_and_moments(state, episode, expert_episodes)
-        return matching.closest_plan(*compared)
+    ) -> SilState:
+        del learner, episode
+        params = copy_params(state.embedding.params)
+        # One demonstration at a time: all at once would need gigabytes.
+        features = jax.lax.map(lambda f: embed(params, f), expert_episodes.frames)
+        return state.replace(compared=params, expert_features=features)
 
-    return Rewarder(
-        rewards,
-        init,
-        update,
-        observe,
-        expert_batch_size=batch_size,
-        matches_episodes=True,
-        ignores_padding=True,
-        summary=lambda state: {"sinkhorn/scale": state.scale},
+    rewarder = make_comparing_rewarder(
+        init=init,
+        update_features=update_features,
+        embed=lambda state, frames: embed(state.compared, frames),
+        compare=matching.rewards,
+        plan=matching.closest_plan,
+        return_scale=return_scale,
         rewards_changed=lambda state: True,
-        plan=plan,
     )
+    return rewarder._replace(update=update, expert_batch_size=batch_size)
 
 
 def batch_distance(matching: Matching, agent: Array, expert: Array) -> Array:
