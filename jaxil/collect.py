@@ -110,6 +110,9 @@ def _record_policy(values: flags.FlagValues) -> None:
         environment = tasks.make_recorded(
             values.task, image_size=values.image_size, **settings
         )
+    except ValueError as error:
+        raise UsageError(f"--task={values.task}: {error}") from error
+    try:
         _write(
             values,
             environment,

@@ -19,7 +19,7 @@ from absl import flags
 from jaxil import config as jaxil_config
 from jaxil import methods, outside, presets
 from jaxil.config import Config
-from jaxil.errors import EnvironmentsFailed, Fault, UsageError, raised, unknown_name
+from jaxil.errors import Fault, RunFailed, UsageError, raised, unknown_name
 from jaxil.files.settings import flat
 
 Define = Callable[[flags.FlagValues], None]
@@ -114,7 +114,7 @@ def run(main: Callable[[list[str]], int | None]) -> None:
     except UsageError as error:
         print(error, file=sys.stderr)
         status = 2
-    except EnvironmentsFailed as error:
+    except RunFailed as error:
         print(error, file=sys.stderr)
         status = 1
     except KeyboardInterrupt:

@@ -1,11 +1,12 @@
 """User errors as data: field, value, rule, way out."""
 
+import contextlib
 import dataclasses
 import difflib
 import pathlib
 import sysconfig
 import traceback
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 _SHORT_LIST = 20
@@ -77,8 +78,36 @@ class UsageError(Exception):
         return "Invalid configuration:\n" + "\n".join(f"  - {f}" for f in shown)
 
 
-class EnvironmentsFailed(RuntimeError):
+class RunFailed(RuntimeError):
+    """What was begun cannot go on; the message says why."""
+
+
+class EnvironmentsFailed(RunFailed):
     """An environment raised an error in an episode, or its process keeps dying."""
+
+
+class MethodError(RunFailed):
+    """A method breaks its interface."""
+
+
+class TrainingDiverged(RunFailed):
+    """A loss, a reward or an action is no longer a finite number."""
+
+
+@contextlib.contextmanager
+def told_as_the_tasks(what: str) -> Iterator[None]:
+    """Raises EnvironmentsFailed for any error of a task's code in this block.
+
+    Args:
+      what: was being done, for the message.
+    """
+    try:
+        yield
+    except (RunFailed, UsageError):
+        raise
+    except Exception as error:
+        words = f"the task raised an error in {what}: {raised(error)}"
+        raise EnvironmentsFailed(words) from error
 
 
 def raised(error: BaseException) -> str:

@@ -9,7 +9,7 @@ Rerun the same command to resume. `python -m jaxil.launch` is the same command.
 from absl import flags
 
 from jaxil import command
-from jaxil.errors import EnvironmentsFailed, UsageError
+from jaxil.errors import RunFailed, UsageError
 
 
 def main(argv: list[str]) -> int:
@@ -41,11 +41,7 @@ def main(argv: list[str]) -> int:
         try:
             workdir.write_config(folder, config, description)
             finished = train.train(config, folder)
-        except (
-            train.TrainingDiverged,
-            EnvironmentsFailed,
-            workdir.RunFolderError,
-        ) as error:
+        except (RunFailed, workdir.RunFolderError) as error:
             screen.say(f"training stopped: {error}")
             return 1
     return 0 if finished else 130

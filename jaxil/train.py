@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxil import methods
 from jaxil.config import Config
-from jaxil.errors import EnvironmentsFailed
+from jaxil.errors import EnvironmentsFailed, TrainingDiverged, told_as_the_tasks
 from jaxil.machine import screen
 from jaxil.machine.signals import StopOnSignals
 from jaxil.maths.types import Episode
@@ -22,10 +22,6 @@ from jaxil.training.run_log import as_floats
 # repeats those of an unbroken one without a stored state.
 _UNIFORM_ACTIONS, _SAMPLED_BATCHES = 1, 2
 _EXPLORATION_KEY = 2**32 - 2  # a fold_in number that no update has
-
-
-class TrainingDiverged(RuntimeError):
-    """A loss or reward is no longer a finite number."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -59,7 +55,7 @@ class Run(Parts):
 
         Raises:
           EnvironmentsFailed: the task raised an error, or its processes keep dying.
-          TrainingDiverged: a loss or reward is not finite any more.
+          TrainingDiverged: a loss, a reward or an action is not finite any more.
         """
         config, counters, player = self.config, self.counters, self.player
         act = self.stopwatch.timed("update", self.act)
@@ -121,6 +117,7 @@ class Run(Parts):
             key = self.exploration_key
             sampled = self.agent.sample_action(encoder, actor, padded, key, steps)
             actions[~uniform] = np.asarray(sampled)[:count][~uniform]
+            self.require_finite({"an action": float(np.sum(actions))})
         return actions
 
     def learn(self, num_steps: int) -> None:
@@ -166,10 +163,11 @@ class Run(Parts):
         self.stopwatch.timed("update", jax.block_until_ready)(self.state.num_updates)
         start = time.perf_counter()
         rewards = self.reward(episode)
-        self.replay.add_episode(**episode._replace(rewards=rewards)._asdict())
+        with told_as_the_tasks("an episode"):  # the state's numbers are not finite
+            self.replay.add_episode(**episode._replace(rewards=rewards)._asdict())
         self.updates.episode_added()
         if self.refresh_is_due():
-            self.updates.refresh_rewards(self.state)
+            self.updates.refresh_rewards(self.state, self.require_finite)
             self.counters.last_refresh_step = self.counters.num_steps
         seconds = time.perf_counter() - start
         self.stopwatch.reward_seconds += seconds
@@ -288,15 +286,16 @@ class Run(Parts):
 
     def finish(self) -> None:
         """Saves what is not saved yet."""
-        self.progress.close()
         if self.counters.last_checkpoint_step != self.counters.num_steps:
             self.save()
 
     def close(self) -> None:
-        """Ends the processes of several environments, and closes the loggers."""
-        if self.player is not None:
-            self.player.close()
-        self.log.close()
+        """Ends the line, the loggers, and the processes of several environments."""
+        with contextlib.ExitStack() as closing:
+            if self.player is not None:
+                closing.callback(self.player.close)
+            closing.callback(self.log.close)
+            closing.callback(self.progress.close)
 
     def ask_to_stop(self, who: str) -> bool:
         """Makes the loop end after this step; returns False if already asked to."""

@@ -65,7 +65,7 @@ class Dummies:
                 collect=self._collect,
                 run=lambda state: (state, None),
                 episode_added=lambda: None,
-                refresh_rewards=lambda _: self.tape.append("refresh"),
+                refresh_rewards=lambda *_: self.tape.append("refresh"),
             ),
             experts=None,
             evaluator=_part(

@@ -138,7 +138,7 @@ def test_an_error_in_mid_episode_ends_a_run_in_one_message(monkeypatch, tmp_path
     flags = (f"--config=drqv2:{task}", *small("drqv2"), f"--workdir={tmp_path}")
     ended = call("launch", *flags, "--config.action_repeat=1")
     assert ended.returncode == 1
-    assert "training stopped: the task raised an error in mid-episode" in ended.stderr
+    assert "training stopped: the task raised an error in a step" in ended.stderr
     assert "NaN in the simulation (test_own_task_faults.py, line " in ended.stderr
     assert "Rerun the same command to resume" in ended.stderr
     assert "Traceback" not in ended.stderr

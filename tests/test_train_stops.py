@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxil import train
-from jaxil.errors import EnvironmentsFailed
+from jaxil.errors import EnvironmentsFailed, TrainingDiverged
 from tests.dummies import Dummies, acts_and_episodes, make_config
 
 
@@ -158,9 +158,18 @@ def test_a_resumed_run_starts_at_its_own_episode():
 
 def test_a_reward_that_is_not_finite_stops_the_run_before_it_is_stored():
     dummies = Dummies(reward=float("nan"))
-    with pytest.raises(train.TrainingDiverged, match="imitation reward became"):
+    with pytest.raises(TrainingDiverged, match="imitation reward became"):
         dummies.loop()
     assert not dummies.num_stored
+
+
+def test_an_action_that_is_not_finite_stops_the_run_before_the_task_gets_it():
+    dummies = Dummies(exploration_steps=0)
+    sample = dummies.run.agent.sample_action
+    dummies.run.agent.sample_action = lambda *seen: sample(*seen) * np.nan
+    with pytest.raises(TrainingDiverged, match="an action became infinite or NaN"):
+        dummies.loop()
+    assert not any(word.startswith("step") for word in dummies.tape)
 
 
 @pytest.mark.parametrize(("newest", "said"), [(None, "none"), (4000, "frame 4000")])
@@ -169,7 +178,7 @@ def test_numbers_that_are_not_finite_stop_the_run(newest, said):
     dummies.run.checkpoints.newest = lambda: newest
     metrics = {"critic/loss": np.float32("nan"), "actor/loss": np.float32(1.0)}
     dummies.run.updates.run = lambda state: (state, metrics)
-    with pytest.raises(train.TrainingDiverged, match=said) as caught:
+    with pytest.raises(TrainingDiverged, match=said) as caught:
         dummies.loop()
     assert "critic/loss" in str(caught.value)
     assert "update 12" in str(caught.value)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxil.demonstrations.readers.recording import PixelEpisode
+from jaxil.errors import told_as_the_tasks
 
 Decide = Callable[[int, np.ndarray], np.ndarray]  # step, observation -> action [A]
 Begin = Callable[[int], Decide]  # episode number -> its controller, after the reset
@@ -49,19 +50,21 @@ def _played(
 ) -> Iterator[tuple[list[Any], np.ndarray, np.ndarray]]:
     """Yields `look()` at the N + 1 times of an episode, actions [N, A], rewards [N]."""
     for episode in range(num_episodes):
-        timestep = environment.reset(episode=episode)
-        decide = begin(episode)
-        seen, actions, rewards = [look()], [], []
+        with told_as_the_tasks("a reset"):
+            timestep = environment.reset(episode=episode)
+            seen = [look()]
+        decide, actions, rewards = begin(episode), [], []
         while not timestep.last():
             action = decide(len(actions), timestep.observation)
             actions.append(np.asarray(action, np.float32))
-            timestep = environment.step(actions[-1])
+            with told_as_the_tasks("a step"):
+                timestep = environment.step(actions[-1])
+                seen.append(look())
             if not math.isfinite(timestep.reward):
                 raise ValueError(
                     f"the task's reward is {timestep.reward} after step {len(rewards)} "
                     f"of episode {episode}"
                 )
             rewards.append(timestep.reward)
-            seen.append(look())
         finished(episode, sum(rewards))
         yield seen, np.stack(actions), np.asarray(rewards, np.float32)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxil.environments.interaction import Environments, Moment
-from jaxil.errors import EnvironmentsFailed, raised
+from jaxil.errors import told_as_the_tasks
 from jaxil.maths.types import Episode
 
 
@@ -112,6 +112,9 @@ class Player:
 
         Args:
           wanted: asked for each new episode, by its number, whether to play it.
+
+        Raises:
+          EnvironmentsFailed: see `observe`.
         """
         begun = []
         for index in range(self._environments.size):
@@ -193,13 +196,8 @@ class Player:
         self._environments.step(index, action)
 
     def _receive(self, index: int) -> None:
-        try:
+        with told_as_the_tasks("a step" if self._open[index].frames else "a reset"):
             moment = self._environments.receive(index)
-        except EnvironmentsFailed:
-            raise
-        except Exception as error:
-            what = "the task raised an error in mid-episode"
-            raise EnvironmentsFailed(f"{what}: {raised(error)}") from error
         if moment is None:  # lost, and the episode with it
             self._begin_anew(index)
         else:

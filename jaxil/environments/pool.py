@@ -6,7 +6,6 @@ import os
 import signal
 import socket
 import struct
-import traceback
 from collections.abc import Callable, Iterator
 from multiprocessing import resource_tracker
 from typing import Any
@@ -15,7 +14,7 @@ import numpy as np
 
 from jaxil.environments.interaction import Moment
 from jaxil.environments.player import InProcess
-from jaxil.errors import EnvironmentsFailed
+from jaxil.errors import EnvironmentsFailed, raised
 
 # Rendered in software, the heaviest task takes a second per step; imports and the first
 # image take 5 s, or a minute on a busy machine.
@@ -108,7 +107,7 @@ class Pool:
                 self._losses[index] = 0
             return answer
         if worker.has_raised:
-            raise EnvironmentsFailed(f"environment {index} raised an error:\n{answer}")
+            raise EnvironmentsFailed(f"environment {index} raised an error: {answer}")
         self._workers.pop(index).close()
         self._reasons[index] = answer
         self._losses[index] += 1
@@ -184,6 +183,6 @@ def _serve(make: Callable[[], Any], pipe: Any) -> None:
                 pipe.send(environment.receive(0))
         except (EOFError, ConnectionError):
             raise  # the parent is gone
-        except Exception:
-            pipe.send(traceback.format_exc().rstrip())
+        except Exception as error:
+            pipe.send(raised(error))
     os._exit(0)  # without cleanup, in which GL drivers may hang

@@ -6,12 +6,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxil.errors import MethodError
 from jaxil.learner.rewarder import Rewarder
 from jaxil.maths.types import AnyEpisode
 
 
 def checked_rewarder(name: str, rewarder: Rewarder) -> Rewarder:
-    """Returns the rewarder, which raises ValueError where it breaks its interface.
+    """Returns the rewarder, which raises MethodError where it breaks its interface.
 
     Checked are shapes and types, once for each compilation: rewards are [T], and
     `observe` and `update` return a state like the one that they got. A state that
@@ -27,9 +28,10 @@ def checked_rewarder(name: str, rewarder: Rewarder) -> Rewarder:
         expected, shape = (episode.actions.shape[0],), getattr(found, "shape", None)
         if shape != expected:
             what = type(found).__name__ if shape is None else f"shape {shape}"
-            raise ValueError(
+            raise MethodError(
                 f"{name}: `rewards` returned {what} for an episode of {expected[0]} "
-                f"steps; expected one reward for each, shape {expected}"
+                "actions, padding included; expected one reward for each, shape "
+                f"{expected}"
             )
         return jnp.asarray(found)
 
@@ -51,7 +53,7 @@ def _like(name: str, function: str, before: Any, after: Any) -> Any:
         if old.get(key) != new.get(key)
     ]
     if changed or jax.tree.structure(before) != jax.tree.structure(after):
-        raise ValueError(
+        raise MethodError(
             f"{name}: `{function}` returned a state unlike that of `init`: "
             f"{'; '.join(changed) or 'its structure differs'}"
         )

@@ -13,6 +13,7 @@ from jaxil.maths.types import (
     AnyEpisode,
     Batch,
     Data,
+    Episode,
     ExpertBatch,
     ExpertEpisodes,
     Metrics,
@@ -126,9 +127,11 @@ class Rewarder(NamedTuple):
         not, `expert_episodes` is None.
       samples_successors: whether samples of agent and expert include the observation
         one step later.
-      ignores_padding: whether `observe` and the first `episode.num_steps` rewards do
-        not depend on what follows these steps. If so, both get short episodes with
-        their last frame and action repeated, and are compiled for fewer lengths.
+      ignores_padding: whether `observe`, `plan` and the first `episode.num_steps`
+        rewards do not depend on what follows these steps. If so, all three get a
+        `PaddedEpisode`, short ones with their last frame and action repeated, and are
+        compiled for fewer lengths; `num_steps` is traced then. If not, they get an
+        `Episode`.
       relabel: (state, learner, batch) -> rewards [B, n], for methods that reward each
         batch by the current state; `batch` has its window. None where rewards are
         stored.
@@ -210,8 +213,10 @@ def make_refresh(rewarder: Rewarder) -> Callable[..., Array]:
 
         def episode_rewards(stored: tuple[Array, Array, Array]) -> Array:
             frame_indices, taken, steps = stored
-            shown = frames[frame_indices]
-            episode = PaddedEpisode(shown, taken, unknown, unknown, steps)
+            parts = frames[frame_indices], taken, unknown, unknown
+            episode = Episode(*parts)
+            if rewarder.ignores_padding:
+                episode = PaddedEpisode(*parts, steps)
             return rewarder.rewards(state, learner, episode, expert_episodes)
 
         # One at a time: a batch of episodes would need gigabytes.

@@ -21,6 +21,8 @@ from jaxil.maths import augmentation, distributions, losses
 from jaxil.maths.types import Batch, Data, ExpertBatch, Metrics, Params
 from jaxil.networks.agent import AgentNetworks, apply, critic_features
 
+_SUCCESSOR_KEY = 2**30
+
 UpdateStep = Callable[
     [TrainState, Batch, ExpertBatch | None], tuple[TrainState, Metrics]
 ]
@@ -158,8 +160,10 @@ def _with_successors(
 ) -> AgentView:
     """Adds the fields of `AgentView` that describe successors."""
     assert batch.successor is not None
-    # A separate key, so that no other random number depends on successors.
-    successor = _augment(learner, batch.successor, jax.random.fold_in(key, 1))
+    # A separate key, so that no other random number depends on successors. The method
+    # splits `key` too, and `split(key)[n]` may be `fold_in(key, n)`.
+    successor_key = jax.random.fold_in(key, _SUCCESSOR_KEY)
+    successor = _augment(learner, batch.successor, successor_key)
     features = critic_features(
         learner.networks, before.encoder, before.critic, successor
     )

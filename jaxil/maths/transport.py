@@ -53,10 +53,10 @@ def simultaneous_plan(cost: Array, agent_mass: Array, expert_mass: Array) -> Arr
     """
     chex.assert_rank([cost, agent_mass, expert_mass], [2, 1, 1])
     chex.assert_shape(cost, (*agent_mass.shape, *expert_mass.shape))
-    num_steps, length = cost.shape
+    agent_length, expert_length = cost.shape
     last = jnp.sum(expert_mass > 0.0) - 1
-    partners = jnp.minimum(jnp.arange(num_steps), last)
-    pairs = jax.nn.one_hot(partners, length, dtype=cost.dtype)
+    partners = jnp.minimum(jnp.arange(agent_length), last)
+    pairs = jax.nn.one_hot(partners, expert_length, dtype=cost.dtype)
     return agent_mass[:, None] * pairs
 
 

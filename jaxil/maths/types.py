@@ -119,8 +119,8 @@ class PaddedEpisode(NamedTuple):
     Functions that are compiled for a shape get few shapes this way.
 
     Attributes:
-      frames, actions, rewards, discounts: as in `Episode`, with T no less than its own.
-      num_steps: the episode's own T; what follows is padding. Shape [].
+      frames, actions, rewards, discounts: as in `Episode`, padded to T >= `num_steps`.
+      num_steps: the episode's own steps; what follows is padding. Shape [].
     """
 
     frames: Data

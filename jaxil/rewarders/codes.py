@@ -136,8 +136,8 @@ def _sample_episode(episode: AnyEpisode) -> tuple[Array, Array]:
     """
     frames, num_steps = jnp.asarray(episode.frames), episode.num_steps
     num_rows = min(_EPISODE_ROWS, len(frames))
-    moments = jnp.linspace(0, jnp.maximum(num_steps, num_rows - 1), num_rows)
-    moments = moments.astype(jnp.int32)
+    last = jnp.maximum(num_steps, num_rows - 1)
+    moments = jnp.arange(num_rows) * last // max(num_rows - 1, 1)
     return _rows(frames[moments]), (moments <= num_steps).astype(jnp.float32)
 
 

@@ -54,7 +54,8 @@ class Matching(NamedTuple):
     def _costs_and_plans(
         self, agent: Array, agent_moments: Array, experts: Array, expert_moments: Array
     ) -> tuple[Array, Array]:
-        chex.assert_rank([agent, experts, expert_moments], [2, 3, 1])
+        compared = [agent, agent_moments, experts, expert_moments]
+        chex.assert_rank(compared, [2, 0, 3, 1])
         chex.assert_equal_shape_prefix([experts, expert_moments], 1)
         agent_mass = transport.uniform_mass(agent_moments, len(agent))
 

@@ -178,7 +178,9 @@ def make_rewarder(
         def first_scale() -> Array:
             x = stacking.stack_frames(episode.frames, frame_stack=agent.frame_stack)
             found = similarity(state, logits(state.params, (x[:-1], x[1:])))
-            return _FIRST_SIMILARITY[variant] / jnp.mean(found)
+            own = jnp.arange(len(found)) < episode.num_steps
+            mean = jnp.sum(jnp.where(own, found, 0.0)) / episode.num_steps
+            return _FIRST_SIMILARITY[variant] / mean
 
         scale = jax.lax.cond(state.scale > 0.0, lambda: state.scale, first_scale)
         return state.replace(scale=scale)

@@ -158,7 +158,6 @@ class Bench:
     def close(self) -> None:
         """Ends worker processes and closes files."""
         self.run.close()
-        self.run.log.close()
 
     def _physics_step(self) -> Callable[[], Any]:
         """Returns a function that steps an environment without rendering."""

@@ -30,7 +30,7 @@ from jaxil.learner.update import (
     init_train_state,
     make_update_step,
 )
-from jaxil.maths.types import Episode, ExpertEpisodes, PaddedEpisode
+from jaxil.maths.types import AnyEpisode, Episode, ExpertEpisodes
 from jaxil.native import build, encoding
 from jaxil.networks.agent import AgentNetworks, make_agent_networks
 from jaxil.training import lengths
@@ -45,13 +45,14 @@ class Agent(NamedTuple):
       repeated_step: the same for several batches, see `gathering.make_repeated_step`.
       sample_action: see `policy.make_sample_action`.
       mean_action: see `policy.make_mean_action`.
-      observe: the rewarder's.
-      rewards: (rewarder state, learner, episode, expert episodes) -> the rewarder's
-        rewards, a NumPy array [T].
-      compiled_length: (T) -> the length for which `observe`, `rewards` and `refresh` of
-        an episode of T steps are compiled.
+      observe: (rewarder state, learner, episode, expert episodes) -> state, the
+        rewarder's; the episode is a whole one, without padding.
+      rewards: the same arguments -> the rewarder's rewards, a NumPy array [T].
+      compiled_length: (T) -> the length for which `observe`, `rewards`, `plan` and
+        `refresh` of an episode of T steps are compiled.
       refresh: rewards of stored episodes as of now, see `rewarder.make_refresh`.
-      plan: the rewarder's; None where it has none.
+      plan: the same arguments -> the rewarder's plan, a NumPy array [T + 1, N + 1],
+        and the index of its demonstration; None where it has none.
       rewarder: the method itself.
       mean_image: what the encoder subtracts, where that is the demonstrations' mean
         image; None otherwise.
@@ -259,11 +260,14 @@ def make_agent(
             return num_steps
         return lengths.padded_length(num_steps, usual_steps)
 
-    def pad(episode: Episode) -> PaddedEpisode:
+    def pad(episode: Episode) -> AnyEpisode:
+        if not rewarder.ignores_padding:
+            return episode  # whose number of steps is known when it is compiled
         return lengths.pad_episode(episode, compiled_length(episode.num_steps))
 
     compiled_observe = jax.jit(rewarder.observe)
     compiled_rewards = jax.jit(rewarder.rewards)
+    compiled_plan = None if rewarder.plan is None else jax.jit(rewarder.plan)
 
     def observe(state: Any, params: Any, episode: Episode, experts: Any) -> Any:
         return compiled_observe(state, params, pad(episode), experts)
@@ -271,6 +275,13 @@ def make_agent(
     def rewards(state: Any, params: Any, episode: Episode, experts: Any) -> np.ndarray:
         found = compiled_rewards(state, params, pad(episode), experts)
         return np.asarray(found)[: episode.num_steps]
+
+    def plan(
+        state: Any, params: Any, episode: Episode, experts: Any
+    ) -> tuple[np.ndarray, int]:
+        assert compiled_plan is not None
+        found, index = compiled_plan(state, params, pad(episode), experts)
+        return np.asarray(found)[: episode.num_steps + 1], int(index)
 
     def init_state() -> TrainState:
         key = jax.random.key(config.seed)
@@ -289,7 +300,7 @@ def make_agent(
         rewards=rewards,
         compiled_length=compiled_length,
         refresh=jax.jit(make_refresh(rewarder)),
-        plan=None if rewarder.plan is None else jax.jit(rewarder.plan),
+        plan=None if rewarder.plan is None else plan,
         rewarder=rewarder,
         mean_image=mean if isinstance(mean, np.ndarray) else None,
         # Compiled, and cached: dispatched one by one, its 450 operations take longer.

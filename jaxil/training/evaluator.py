@@ -130,7 +130,7 @@ class Evaluator:
             plan, index = self._agent.plan(*arguments)
             length = int(self._experts.num_frames[index])
             expert_frames = self._experts.frames[index]
-            found["plan"] = np.asarray(plan)[:, :length]
+            found["plan"] = plan[:, :length]
             if expert_frames.ndim == 4:
                 found["agent_strip"] = _strip(episode.frames)
                 found["expert_strip"] = _strip(expert_frames[:length])

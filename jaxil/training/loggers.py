@@ -43,7 +43,7 @@ class Logger(Protocol):
         ...
 
     def close(self) -> None:
-        """Ends the log of a run that is finished or stopped."""
+        """Ends the log of a run that is finished or stopped, or has failed."""
         ...
 
 
@@ -188,8 +188,8 @@ class WeightsAndBiases:
         self._run.log({"video": self._video(str(path), format="mp4")}, step=frame)
 
     def close(self) -> None:
-        """Marks the run as finished."""
-        self._run.finish()
+        """Marks the run as finished, or as failed if it is closed by an error."""
+        self._run.finish(exit_code=int(sys.exc_info()[0] is not None))
 
 
 def _known(group: str, values: Mapping[str, float]) -> dict[str, float]:

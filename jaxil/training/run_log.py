@@ -1,5 +1,6 @@
 """What a run writes for its user: tables, events, learning curve, videos."""
 
+import contextlib
 import io
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -11,6 +12,7 @@ from jaxil import methods
 from jaxil.config import Config
 from jaxil.demonstrations import loading
 from jaxil.environments.evaluation import Evaluation
+from jaxil.errors import MethodError
 from jaxil.files import video
 from jaxil.files.tables import CsvLog
 from jaxil.files.writing import write_atomically
@@ -199,17 +201,17 @@ class Outputs:
         return line
 
     def close(self) -> None:
-        """Closes the loggers."""
-        with writes_to(self._workdir):
+        """Closes the loggers, all of them even if one fails."""
+        with writes_to(self._workdir), contextlib.ExitStack() as closing:
             for logger in self._loggers:
-                logger.close()
+                closing.callback(logger.close)
 
     def _write_training(
         self, frame: int, seconds: float, episode: int, values: Mapping[str, Any]
     ) -> None:
         unknown = sorted(set(values) - {*TRAIN_COLUMNS, *self._metrics})
         if unknown:
-            raise ValueError(
+            raise MethodError(
                 f"{self._config.method} returns metrics that it does not declare: "
                 f"{', '.join(unknown)}; name them in METHOD.metrics"
             )

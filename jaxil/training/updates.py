@@ -1,5 +1,7 @@
 """Samples batches and runs the learner's updates, several in one call."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -99,14 +101,14 @@ class Updates:
         if self._device_copy is not None:
             self._device_copy.refresh()
 
-    def refresh_rewards(self, state: TrainState) -> None:
+    def refresh_rewards(
+        self, state: TrainState, require_finite: Callable[[dict[str, float]], None]
+    ) -> None:
         """Recomputes the rewards of all stored episodes with the current rewarder.
 
         Args:
           state: read; not donated.
-
-        Raises:
-          ValueError: a reward is not finite.
+          require_finite: called with rewards before they replace others.
         """
         replay = self._replay
         by_length: dict[int, list[int]] = {}
@@ -119,6 +121,7 @@ class Updates:
                 # Always of one size, so that each length compiles once.
                 filled = chunk + chunk[-1:] * (_REFRESH_EPISODES - len(chunk))
                 rewards = self._refreshed(state, filled, length)[: len(chunk)]
+                require_finite({"recomputed reward": float(np.sum(rewards))})
                 for index, new in zip(chunk, rewards, strict=True):
                     replay.replace_rewards(index, new[: len(replay.slots(index)) - 1])
 

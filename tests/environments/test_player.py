@@ -176,7 +176,7 @@ def test_one_environment_of_this_process_steps_when_it_is_waited_for():
     assert single.receive(0).is_last
 
 
-def test_an_error_of_the_task_in_mid_episode_says_what_and_where():
+def test_an_error_of_the_task_in_a_step_says_what_and_where():
     environment = Counting(3)
 
     def step(action):
@@ -189,5 +189,5 @@ def test_an_error_of_the_task_in_mid_episode_says_what_and_where():
     with pytest.raises(EnvironmentsFailed) as caught:
         player.observe()
     said = str(caught.value)
-    assert "raised an error in mid-episode: FloatingPointError: the arm broke" in said
+    assert "raised an error in a step: FloatingPointError: the arm broke" in said
     assert "(test_player.py, line " in said

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxil.errors import MethodError
 from jaxil.learner.checked import checked_rewarder
 from jaxil.learner.rewarder import Rewarder
 from jaxil.maths.types import Episode
@@ -34,7 +35,7 @@ def _rewarder(**functions) -> Rewarder:
 )
 def test_rewards_are_one_for_each_step(found, named):
     rewarder = _rewarder(rewards=lambda *_: found)
-    with pytest.raises(ValueError, match=f"mine: `rewards` returned {named}.*4 steps"):
+    with pytest.raises(MethodError, match=f"mine: `rewards` returned {named}.*4 actions"):
         jax.eval_shape(rewarder.rewards, _STATE, _ANY, _EPISODE, None)
 
 
@@ -54,9 +55,9 @@ def test_a_state_stays_what_init_made_it(change, named):
         observe=lambda state, *_: change(state),
         update=lambda state, *_: (change(state), {}),
     )
-    with pytest.raises(ValueError, match=f"mine: `observe` .*{named}"):
+    with pytest.raises(MethodError, match=f"mine: `observe` .*{named}"):
         jax.eval_shape(rewarder.observe, _STATE, _ANY, _EPISODE, None)
-    with pytest.raises(ValueError, match=f"mine: `update` .*{named}"):
+    with pytest.raises(MethodError, match=f"mine: `update` .*{named}"):
         jax.eval_shape(rewarder.update, _STATE, _ANY, _ANY, None, _ANY)
 
 

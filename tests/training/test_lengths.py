@@ -3,13 +3,16 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxil import methods
+from jaxil.learner.rewarder import Rewarder
 from jaxil.maths.types import Episode
+from jaxil.rewarders import zero
 from jaxil.training import agent as agents
 from jaxil.training import assembly, lengths
 from jaxil.training.updates import Updates
@@ -121,6 +124,44 @@ def test_comparisons_of_whole_episodes_do_not_see_the_padding(method, settings):
     assert rewards.shape == (9,)
     assert np.ptp(rewards) > 0
     np.testing.assert_allclose(rewards, expected, rtol=1e-4, atol=1e-6)
+    if agent.plan is not None:
+        plan, index = agent.plan(observed, state.params, episode, experts)
+        expected = without_padding(agent, "plan", state, episode, experts)
+        assert plan.shape == (10, STEPS + 1)
+        assert index == expected[1]
+        np.testing.assert_allclose(plan, expected[0], rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("variant", ["weighted", "bonus"])
+def test_the_first_similarity_is_that_of_an_episodes_own_steps(variant):
+    config = make_config("patchail")
+    config.discriminator.variant = variant
+    agent, _ = matching_agent(config)
+    state, episode = agent.init_state(), draw_episode(9)
+    observed = agent.observe(state.rewarder, state.params, episode, None)
+    expected = without_padding(agent, "observe", state, episode, None)
+    assert expected.scale > 0
+    np.testing.assert_allclose(observed.scale, expected.scale, rtol=1e-5)
+
+
+def test_a_method_that_does_not_ignore_padding_gets_episodes_as_they_are(monkeypatch):
+    def make_rewarder(agent):
+        def rewards(state, learner, episode, experts):
+            assert isinstance(episode, Episode)
+            return jnp.arange(episode.num_steps) / episode.num_steps
+
+        return Rewarder(rewards)
+
+    monkeypatch.setattr(zero, "make_rewarder", make_rewarder)
+    (agent, _), episode = matching_agent(make_config("zero")), draw_episode(9)
+    assert agent.compiled_length(9) == 9
+    state = agent.init_state()
+    expected = np.arange(9) / 9
+    rewards = agent.rewards(state.rewarder, state.params, episode, None)
+    np.testing.assert_allclose(rewards, expected, rtol=1e-6)
+    stored = (np.arange(10)[None], episode.actions[None], np.array([9]), None)
+    rewards = agent.refresh(state.rewarder, state.params, episode.frames, *stored)
+    np.testing.assert_allclose(rewards[0], expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("on_device", [False, True])
@@ -136,8 +177,10 @@ def test_stored_episodes_of_all_lengths_are_rewarded_anew(method, on_device):
     state, before = agent.init_state(), agent.refresh._cache_size()
     observed = agent.observe(state.rewarder, state.params, episodes[0], experts)
     state = state.replace(rewarder=observed)
+    checked = []
     updates = Updates(config, agent, replay, demonstrations, experts)
-    updates.refresh_rewards(state)
+    updates.refresh_rewards(state, checked.append)
+    assert np.isfinite([value for each in checked for value in each.values()]).all()
     for number, episode in enumerate(episodes):
         expected = agent.rewards(state.rewarder, state.params, episode, experts)
         stored = replay.rewards(number)

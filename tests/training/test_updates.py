@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from jaxil import train
+from jaxil.errors import TrainingDiverged
 from jaxil.files.tables import read_csv
 from jaxil.maths.types import Episode
 from jaxil.training import agent as agents
@@ -202,9 +203,9 @@ def test_refreshed_rewards_are_those_of_now(tmp_path):
     run = make_run(tmp_path, "pdac", reward_refresh_steps=1, update_every_steps=3)
     refreshed, refresh = [], run.updates.refresh_rewards
 
-    def counting_refresh(state):
+    def counting_refresh(state, require_finite):
         refreshed.append(run.counters.num_steps)
-        refresh(state)
+        refresh(state, require_finite)
 
     run.updates.refresh_rewards = counting_refresh
     finished(run)
@@ -219,6 +220,15 @@ def test_refreshed_rewards_are_those_of_now(tmp_path):
         )
         np.testing.assert_allclose(run.replay.rewards(number), rewards, rtol=1e-5)
         assert np.ptp(np.asarray(rewards)) > 0
+
+
+def test_a_recomputed_reward_that_is_not_finite_stops_the_run(tmp_path):
+    run = make_run(tmp_path, "pdac", reward_refresh_steps=1, update_every_steps=3)
+    recomputed = np.full((8, STEPS), np.inf, np.float32)
+    run.agent = run.updates._agent = run.agent._replace(refresh=lambda *_: recomputed)
+    with pytest.raises(TrainingDiverged, match="recomputed reward became infinite"):
+        run.loop()
+    run.close()
 
 
 def assert_copied(run):
