@@ -32,7 +32,7 @@ from typing import Any
 from absl import flags
 
 from jaxil import command
-from jaxil.errors import Fault, UsageError, unknown_name
+from jaxil.errors import Fault, UsageError, raised, unknown_name
 
 _NUM_EVAL_EPISODES = 10
 _SEED = 777  # of the recording environment; no training or evaluation uses it
@@ -122,7 +122,7 @@ def _record_policy(values: flags.FlagValues) -> None:
             expert=values.policy,
         )
     except ValueError as error:
-        raise UsageError(f"--policy={values.policy}: {error}") from error
+        raise UsageError(f"--policy={values.policy}: {raised(error)}") from error
 
 
 def _write(

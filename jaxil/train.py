@@ -338,7 +338,8 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
             run.loop()
         except EnvironmentsFailed as error:
             newest = f"Newest checkpoint: {run.newest_checkpoint()}"
-            way_out = "Rerun the same command to resume"
+            does = "start anew" if run.checkpoints.newest() is None else "resume"
+            way_out = f"Rerun the same command to {does}"
             raise EnvironmentsFailed(f"{error}\n{newest}. {way_out}") from error
         run.finish()
     ended, way_on = "finished", "a larger --config.total_frames trains on"

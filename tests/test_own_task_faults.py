@@ -114,6 +114,22 @@ def test_a_reward_that_is_not_finite_does_not_end_a_run():
     assert np.isnan(environment.step(np.zeros(1)).reward)
 
 
+def test_images_have_one_size():
+    task = Task()
+    environment = PixelEnvironment(
+        task,
+        seed=0,
+        action_repeat=1,
+        image_size=8,
+        frame_stack=1,
+        observation="pixels",
+    )
+    environment.reset()
+    task._image = np.zeros((10, 8, 3), np.uint8)
+    with pytest.raises(ValueError, match=r"\(10, 8, 3\) images, but at first \(8, 8"):
+        environment.step(np.zeros(1))
+
+
 def test_an_error_of_the_task_says_where_it_is(monkeypatch):
     def failing():
         raise ValueError("no light")
@@ -140,7 +156,7 @@ def test_an_error_in_mid_episode_ends_a_run_in_one_message(monkeypatch, tmp_path
     assert ended.returncode == 1
     assert "training stopped: the task raised an error in a step" in ended.stderr
     assert "NaN in the simulation (test_own_task_faults.py, line " in ended.stderr
-    assert "Rerun the same command to resume" in ended.stderr
+    assert "there is none. Rerun the same command to start anew" in ended.stderr
     assert "Traceback" not in ended.stderr
 
 

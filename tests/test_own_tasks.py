@@ -258,6 +258,7 @@ def test_a_folder_or_file_alone_makes_python_import_nothing(task, tmp_path):
     config = default_config("zero")
     config.task = task
     workdir.write_config(tmp_path, config, {})
+    workdir.read_config(tmp_path, imports_task=False)  # trusts nothing
     with pytest.raises(UsageError, match=f"--trust={task}"):
         workdir.read_config(tmp_path)
     stored = states.read_states(states.shipped_path("cartpole_swingup"), num_episodes=1)

@@ -15,9 +15,7 @@ from jaxil.environments import tasks
 from jaxil.environments.interaction import Restorable
 from jaxil.files import archive
 
-_WAY_OUT = (
-    "Replace it; `python -m jaxil.collect --inspect=FILE` shows what a file holds"
-)
+_WAY_OUT = "Replace it; `jaxil collect --inspect=FILE` shows what a file holds"
 
 
 class Demonstrations(NamedTuple):

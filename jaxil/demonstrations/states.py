@@ -44,7 +44,7 @@ _METADATA = {
     "returns": list,
 }
 _CHECK_PATH = "Check the path in demonstrations.source"
-_REMAKE = "Record it again with `python -m jaxil.collect`, or use another file"
+_REMAKE = "Record it again with `jaxil collect`, or use another file"
 
 
 class DemonstrationError(ValueError):
@@ -121,7 +121,7 @@ def shipped_path(task: str) -> pathlib.Path:
         raise DemonstrationError(
             f"no demonstrations of {task} are shipped, only of: "
             f"{', '.join(shipped_tasks()) or 'no task'}. Record some with "
-            "`python -m jaxil.collect`, and set demonstrations.source to the file."
+            "`jaxil collect`, and set demonstrations.source to the file."
         )
     return path
 

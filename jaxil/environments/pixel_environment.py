@@ -59,6 +59,7 @@ class PixelEnvironment(dm_env.Environment):
         self._next_episode = 0
         self._reset_next_step = True
         self._seen: Any = None  # the task's own newest observation
+        self._image_shape: tuple[int, ...] = ()  # of the images in it, once seen
         self._current: np.ndarray | None = None  # newest frame, once rendered
         self._frames: list[np.ndarray] = []  # of the observation
         self._frame_stack = frame_stack
@@ -161,9 +162,10 @@ class PixelEnvironment(dm_env.Environment):
 
     def render(self, image_size: int | None = None) -> np.ndarray:
         """Returns a new image, uint8 [H, W, 3], of the given size or the agent's."""
-        images = _images_in(self._seen)
         side = image_size or self.image_size
-        image = images[0] if len(images) == 1 else self._rendered(side)
+        image = self._observed_image()
+        if image is None:
+            image = self._rendered(side)
         size = (side, side)
         if image.shape[:2] == size:
             return np.array(image)
@@ -218,6 +220,17 @@ class PixelEnvironment(dm_env.Environment):
         if hasattr(self._simulator, "seed"):
             self._simulator.seed(int(seeds[0]))
         return self._simulator.reset()
+
+    def _observed_image(self) -> np.ndarray | None:
+        """Returns the image that the task itself observes; None unless it is one."""
+        images = _images_in(self._seen)
+        if len(images) != 1:
+            return None
+        shape, expected = images[0].shape, self._image_shape or images[0].shape
+        if shape != expected:
+            raise ValueError(f"observes {shape} images, but at first {expected}")
+        self._image_shape = shape
+        return images[0]
 
     def _rendered(self, side: int) -> np.ndarray:
         render = getattr(self._simulator, "render", None)

@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import math
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -87,7 +88,7 @@ class ProgressLine:
         """
         if returns and returns is not self._newest:
             self._newest = returns
-            self._history.append(next(iter(returns.values())))
+            self._history += filter(math.isfinite, [*returns.values()][:1])
         now = self._clock()
         if now < self._next_update:
             return
@@ -132,7 +133,7 @@ class ProgressLine:
             parts.append(" ".join(f"{k} {100 * v:.0f}%" for k, v in shares.items()))
         if returns:
             shown = " ".join(f"{name} {value:.1f}" for name, value in returns.items())
-            parts.append(f"return {shown} {_sparkline(self._history)}")
+            parts.append(f"return {shown} {_sparkline(self._history)}".rstrip())
         if speed > 0 and not task.finished:
             parts.append(f"{duration((task.remaining or 0.0) / speed)} left")
         return " | ".join(parts)
@@ -140,6 +141,8 @@ class ProgressLine:
 
 def _sparkline(values: Sequence[float]) -> str:
     """Returns a curve of at most 16 letters, each the mean of its share of values."""
+    if not values:  # a task without rewards may return NaN
+        return ""
     count = min(len(values), _NUM_SPARKS)
     ends = [len(values) * k // count for k in range(count + 1)]
     means = [statistics.fmean(values[a:b]) for a, b in itertools.pairwise(ends)]

@@ -175,7 +175,7 @@ def defaults_of(method: str, task: str) -> dict[str, Any]:
         known, names = method, jaxil_config.fields(method)
     else:
         known, names = next(iter(methods.known())), jaxil_config.FIELDS
-    config = jaxil_config.default_config(known, task)
+    config = jaxil_config.defaults(known, task)
     values = {name: jaxil_config.read(config, name) for name in names}
     return as_stored({**values, "method": method})
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from jaxil import config as jaxil_config
 from jaxil import outside
-from jaxil.config import Config, default_config
+from jaxil.config import Config
 from jaxil.demonstrations import states
 from jaxil.demonstrations.states import DemonstrationError
 from jaxil.environments import tasks
@@ -194,7 +194,7 @@ def read_config(workdir: pathlib.Path, *, imports_task: bool = True) -> Config:
             outside.require_trusted(method, "method", path)
         if imports_task and tasks.names_code(task):
             outside.require_trusted(task, "task", path)
-        config = default_config(method, task)
+        config = jaxil_config.defaults(method, task)
         known = jaxil_config.fields(method)
         there = flat(stored)
         for field in known.keys() & there.keys():

@@ -35,7 +35,9 @@ def _rewarder(**functions) -> Rewarder:
 )
 def test_rewards_are_one_for_each_step(found, named):
     rewarder = _rewarder(rewards=lambda *_: found)
-    with pytest.raises(MethodError, match=f"mine: `rewards` returned {named}.*4 actions"):
+    with pytest.raises(
+        MethodError, match=f"mine: `rewards` returned {named}.*4 actions"
+    ):
         jax.eval_shape(rewarder.rewards, _STATE, _ANY, _EPISODE, None)
 
 

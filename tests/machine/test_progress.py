@@ -51,6 +51,16 @@ def test_returns_are_a_curve_from_the_first_episode_on():
     assert "return task 310.0 imitation -1.0 ▁▁▂▂▃▃▄▄▅▅▆▆▇▇██ |" in stream.getvalue()
 
 
+def test_a_return_that_is_not_a_number_is_shown_and_no_point_of_the_curve():
+    stream = io.StringIO()
+    line, clock = make_line(stream)
+    for value in (float("nan"), 1.0, 2.0):
+        clock.seconds += 60.0
+        line.update(1000, {}, {"task": value})
+    shown = [text.split(" | ")[2] for text in stream.getvalue().splitlines()]
+    assert shown == ["return task nan", "return task 1.0 ▁", "return task 2.0 ▁█"]
+
+
 def test_a_terminal_has_one_live_line_and_messages_above(monkeypatch):
     monkeypatch.setenv("TERM", "xterm")
     stream = Terminal()

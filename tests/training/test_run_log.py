@@ -15,7 +15,7 @@ import pytest
 
 from jaxil import config as jaxil_config
 from jaxil.environments.evaluation import Evaluation
-from jaxil.errors import UsageError
+from jaxil.errors import MethodError, UsageError
 from jaxil.files.tables import CsvLog, read_csv
 from jaxil.training import film, learning_curve, loggers, run_log
 from jaxil.training.workdir import RunFolderError
@@ -55,7 +55,7 @@ def write_episode(outputs, frame=1000, metrics=None):
 def test_a_metric_that_the_method_does_not_declare_is_named(make_outputs, tmp_path):
     outputs = make_outputs(tmp_path)
     write_episode(outputs)
-    with pytest.raises(ValueError, match=r"drqv2 .*: mine/loss; .*METHOD"):
+    with pytest.raises(MethodError, match=r"drqv2 .*: mine/loss; .*METHOD"):
         write_episode(outputs, metrics={"critic/loss": 0.25, "mine/loss": 1.0})
 
 
