@@ -102,29 +102,13 @@ def test_whole_numbers_are_rounded_to(monkeypatch):
 def test_a_reward_that_is_not_finite_does_not_end_a_run():
     """The agent never reads it; only the tables show it."""
     task = Task(reward=np.nan)
-    environment = PixelEnvironment(
-        task,
-        seed=0,
-        action_repeat=1,
-        image_size=8,
-        frame_stack=1,
-        observation="pixels",
-    )
-    environment.reset()
+    environment = begun(task)
     assert np.isnan(environment.step(np.zeros(1)).reward)
 
 
 def test_images_have_one_size():
     task = Task()
-    environment = PixelEnvironment(
-        task,
-        seed=0,
-        action_repeat=1,
-        image_size=8,
-        frame_stack=1,
-        observation="pixels",
-    )
-    environment.reset()
+    environment = begun(task)
     task._image = np.zeros((10, 8, 3), np.uint8)
     with pytest.raises(ValueError, match=r"\(10, 8, 3\) images, but at first \(8, 8"):
         environment.step(np.zeros(1))
@@ -158,6 +142,19 @@ def test_an_error_in_mid_episode_ends_a_run_in_one_message(monkeypatch, tmp_path
     assert "NaN in the simulation (test_own_task_faults.py, line " in ended.stderr
     assert "there is none. Rerun the same command to start anew" in ended.stderr
     assert "Traceback" not in ended.stderr
+
+
+def begun(task):
+    environment = PixelEnvironment(
+        task,
+        seed=0,
+        action_repeat=1,
+        image_size=8,
+        frame_stack=1,
+        observation="pixels",
+    )
+    environment.reset()
+    return environment
 
 
 def settings():
