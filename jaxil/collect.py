@@ -32,7 +32,7 @@ from typing import Any
 from absl import flags
 
 from jaxil import command
-from jaxil.errors import Fault, UsageError, raised, unknown_name
+from jaxil.errors import Fault, UsageError, told_as, unknown_name
 
 _NUM_EVAL_EPISODES = 10
 _SEED = 777  # of the recording environment; no training or evaluation uses it
@@ -122,7 +122,7 @@ def _record_policy(values: flags.FlagValues) -> None:
             expert=values.policy,
         )
     except ValueError as error:
-        raise UsageError(f"--policy={values.policy}: {raised(error)}") from error
+        raise UsageError(f"--policy={values.policy}: {error}") from error
 
 
 def _write(
@@ -143,7 +143,8 @@ def _write(
     from jaxil.environments.interaction import Restorable
 
     def decide(step: int, observation: Any) -> Any:
-        action = np.asarray(act(observation), np.float32)
+        with told_as("the policy", f"step {step}"):
+            action = np.asarray(act(observation), np.float32)
         if not np.all(np.abs(action) <= 1.0):  # nor NaN
             raise ValueError(f"returned {action} at step {step}, not in [-1, 1].")
         return action

@@ -83,7 +83,7 @@ class RunFailed(RuntimeError):
 
 
 class EnvironmentsFailed(RunFailed):
-    """An environment raised an error in an episode, or its process keeps dying."""
+    """A task or policy raised an error in an episode, or a process keeps dying."""
 
 
 class MethodError(RunFailed):
@@ -95,18 +95,19 @@ class TrainingDiverged(RunFailed):
 
 
 @contextlib.contextmanager
-def told_as_the_tasks(what: str) -> Iterator[None]:
-    """Raises EnvironmentsFailed for any error of a task's code in this block.
+def told_as(who: str, what: str) -> Iterator[None]:
+    """Raises EnvironmentsFailed for any error of the user's code in this block.
 
     Args:
-      what: was being done, for the message.
+      who: "the task" or "the policy", for the message.
+      what: was being done.
     """
     try:
         yield
     except (RunFailed, UsageError):
         raise
     except Exception as error:
-        words = f"the task raised an error in {what}: {raised(error)}"
+        words = f"{who} raised an error in {what}: {raised(error)}"
         raise EnvironmentsFailed(words) from error
 
 

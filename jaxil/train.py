@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxil import methods
 from jaxil.config import Config
-from jaxil.errors import EnvironmentsFailed, TrainingDiverged, told_as_the_tasks
+from jaxil.errors import EnvironmentsFailed, TrainingDiverged, told_as
 from jaxil.machine import screen
 from jaxil.machine.signals import StopOnSignals
 from jaxil.maths.types import Episode
@@ -163,7 +163,7 @@ class Run(Parts):
         self.stopwatch.timed("update", jax.block_until_ready)(self.state.num_updates)
         start = time.perf_counter()
         rewards = self.reward(episode)
-        with told_as_the_tasks("an episode"):  # the state's numbers are not finite
+        with told_as("the task", "an episode"):  # the state's numbers are not finite
             self.replay.add_episode(**episode._replace(rewards=rewards)._asdict())
         self.updates.episode_added()
         if self.refresh_is_due():

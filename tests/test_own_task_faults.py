@@ -144,6 +144,34 @@ def test_an_error_in_mid_episode_ends_a_run_in_one_message(monkeypatch, tmp_path
     assert "Traceback" not in ended.stderr
 
 
+@pytest.mark.parametrize(
+    ("policy", "words"),
+    [
+        (
+            lambda seen: {}["left"],
+            "the policy raised an error in step 0: KeyError: 'left'",
+        ),
+        (lambda seen: np.zeros(1), "the task raised an error in a step: FloatingPoint"),
+    ],
+)
+def test_what_fails_while_it_is_recorded_is_one_message(
+    policy, words, monkeypatch, tmp_path
+):
+    class Exploding(Task):
+        def step(self, action):
+            raise FloatingPointError("NaN in the simulation")
+
+    monkeypatch.setitem(globals(), "exploding", Exploding)
+    monkeypatch.setitem(globals(), "policy", policy)
+    output = tmp_path / "expert.npz"
+    names = (f"--policy={__name__}:policy", f"--task={__name__}:exploding")
+    ended = call("collect", *names, f"--output={output}")
+    assert ended.returncode == 1
+    assert ended.stderr.splitlines()[-1].startswith(words)
+    assert "(test_own_task_faults.py, line " in ended.stderr
+    assert not list(tmp_path.iterdir())
+
+
 def begun(task):
     environment = PixelEnvironment(
         task,

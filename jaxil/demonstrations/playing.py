@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxil.demonstrations.readers.recording import PixelEpisode
-from jaxil.errors import told_as_the_tasks
+from jaxil.errors import told_as
 
 Decide = Callable[[int, np.ndarray], np.ndarray]  # step, observation -> action [A]
 Begin = Callable[[int], Decide]  # episode number -> its controller, after the reset
@@ -50,14 +50,14 @@ def _played(
 ) -> Iterator[tuple[list[Any], np.ndarray, np.ndarray]]:
     """Yields `look()` at the N + 1 times of an episode, actions [N, A], rewards [N]."""
     for episode in range(num_episodes):
-        with told_as_the_tasks("a reset"):
+        with told_as("the task", "a reset"):
             timestep = environment.reset(episode=episode)
             seen = [look()]
         decide, actions, rewards = begin(episode), [], []
         while not timestep.last():
             action = decide(len(actions), timestep.observation)
             actions.append(np.asarray(action, np.float32))
-            with told_as_the_tasks("a step"):
+            with told_as("the task", "a step"):
                 timestep = environment.step(actions[-1])
                 seen.append(look())
             if not math.isfinite(timestep.reward):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxil.environments.interaction import Environments, Moment
-from jaxil.errors import told_as_the_tasks
+from jaxil.errors import told_as
 from jaxil.maths.types import Episode
 
 
@@ -196,7 +196,7 @@ class Player:
         self._environments.step(index, action)
 
     def _receive(self, index: int) -> None:
-        with told_as_the_tasks("a step" if self._open[index].frames else "a reset"):
+        with told_as("the task", "a step" if self._open[index].frames else "a reset"):
             moment = self._environments.receive(index)
         if moment is None:  # lost, and the episode with it
             self._begin_anew(index)

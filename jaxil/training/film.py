@@ -14,7 +14,7 @@ from jaxil.demonstrations.states import DemonstrationError
 from jaxil.environments.evaluation import Evaluation, Stopped
 from jaxil.environments.interaction import Restorable
 from jaxil.environments.pixel_environment import PixelEnvironment
-from jaxil.errors import told_as_the_tasks
+from jaxil.errors import told_as
 from jaxil.machine import progress, screen
 from jaxil.training import assembly
 
@@ -44,7 +44,7 @@ def recorder(environment: PixelEnvironment, image_size: int) -> Callable[[], Any
     sees_pixels = len(environment.observation_spec().shape) == 3
 
     def record() -> tuple[np.ndarray | None, Any]:
-        with told_as_the_tasks("an evaluation that is filmed"):
+        with told_as("the task", "an evaluation that is filmed"):
             view = environment.frame() if sees_pixels else None
             if isinstance(environment, Restorable):
                 return view, environment.simulator_state()
