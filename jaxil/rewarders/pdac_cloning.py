@@ -1,11 +1,9 @@
 """P-DAC whose actor also clones actions that inverse models infer for the video."""
 
-from typing import Any
-
 from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, Rewarder
 from jaxil.rewarders import pdac
-from jaxil.rewarders.pseudo_actions import make_cloning_rewarder
+from jaxil.rewarders.pseudo_actions import with_cloning
 
 METHOD = methods.Method(
     name="pdac_cloning",
@@ -27,6 +25,41 @@ METHOD = methods.Method(
 )
 
 
-def make_rewarder(agent: AgentSpec, **settings: Any) -> Rewarder:
-    """Returns `pdac.make_rewarder` with `with_cloning`; see there for the settings."""
-    return make_cloning_rewarder(pdac.make_rewarder, agent, settings)
+def make_rewarder(
+    agent: AgentSpec,
+    *,
+    hidden_dim: int,
+    learning_rate: float,
+    gradient_penalty: float,
+    batch_size: int,
+    sees_actions: bool,
+    num_components: int,
+    num_pairs: int,
+    weight: float,
+    trust: str,
+    trust_scale: float,
+    num_models: int,
+    head_dim: int,
+    model_learning_rate: float,
+) -> Rewarder:
+    """Returns `pdac.make_rewarder` with `with_cloning`; see there for the arguments."""
+    inner = pdac.make_rewarder(
+        agent,
+        hidden_dim=hidden_dim,
+        learning_rate=learning_rate,
+        gradient_penalty=gradient_penalty,
+        batch_size=batch_size,
+        sees_actions=sees_actions,
+        num_components=num_components,
+    )
+    return with_cloning(
+        inner,
+        agent,
+        num_pairs=num_pairs,
+        weight=weight,
+        trust=trust,
+        trust_scale=trust_scale,
+        num_models=num_models,
+        head_dim=head_dim,
+        model_learning_rate=model_learning_rate,
+    )

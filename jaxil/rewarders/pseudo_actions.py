@@ -5,7 +5,6 @@ to the next, as in BCO, and infer the actions of the expert's video. The actor t
 follows rewards and, as far as those pseudo-actions are trusted, copies them.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import chex
@@ -15,7 +14,6 @@ import optax
 from flax import struct
 from jax import Array
 
-from jaxil import methods
 from jaxil.learner.rewarder import (
     AgentSpec,
     AgentView,
@@ -55,16 +53,6 @@ class CloningState(struct.PyTreeNode):
 
     inner: RewarderState
     models: ModuleState
-
-
-def make_cloning_rewarder(
-    make_inner: Callable[..., Rewarder], agent: AgentSpec, settings: dict[str, Any]
-) -> Rewarder:
-    """Returns `with_cloning` of a method, between which the settings are divided."""
-    own = {*methods.PSEUDO_ACTIONS, *methods.INVERSE_MODELS}
-    others = {name: settings[name] for name in settings.keys() - own}
-    cloning = {name: settings[name] for name in settings.keys() & own}
-    return with_cloning(make_inner(agent, **others), agent, **cloning)
 
 
 def with_cloning(
