@@ -75,9 +75,10 @@ def _record(values: flags.FlagValues) -> None:
     means = []
     print(f"{'mean':>8}{'std':>8}{'frames':>10}{'minutes':>9}  run")
     for folder, run in zip(values.workdirs, runs, strict=True):
-        evaluation = evaluate(
-            run.environment, run.act, num_episodes=_NUM_EVAL_EPISODES, first_episode=0
-        )
+        with run.environment as environment:
+            evaluation = evaluate(
+                environment, run.act, num_episodes=_NUM_EVAL_EPISODES, first_episode=0
+            )
         means.append(evaluation.mean)
         print(
             f"{evaluation.mean:>8.1f}{evaluation.std:>8.1f}{run.act.frame:>10}"
@@ -85,14 +86,15 @@ def _record(values: flags.FlagValues) -> None:
             flush=True,
         )
     best = runs[int(np.argmax(means))]
-    _write(
-        values,
-        assembly.environment_with_seed(best.config, _SEED),
-        best.act,
-        task=best.config.task,
-        action_repeat=best.config.action_repeat,
-        expert=f"{best.act.description()}; mean action, no noise",
-    )
+    with assembly.environment_with_seed(best.config, _SEED) as environment:
+        _write(
+            values,
+            environment,
+            best.act,
+            task=best.config.task,
+            action_repeat=best.config.action_repeat,
+            expert=f"{best.act.description()}; mean action, no noise",
+        )
 
 
 def _record_policy(values: flags.FlagValues) -> None:
@@ -113,14 +115,15 @@ def _record_policy(values: flags.FlagValues) -> None:
     except ValueError as error:
         raise UsageError(f"--task={values.task}: {error}") from error
     try:
-        _write(
-            values,
-            environment,
-            act,
-            task=values.task,
-            action_repeat=values.action_repeat,
-            expert=values.policy,
-        )
+        with environment:
+            _write(
+                values,
+                environment,
+                act,
+                task=values.task,
+                action_repeat=values.action_repeat,
+                expert=values.policy,
+            )
     except ValueError as error:
         raise UsageError(f"--policy={values.policy}: {error}") from error
 

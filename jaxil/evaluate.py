@@ -6,7 +6,9 @@ The policy takes its mean action. The run is not changed. A video, WORKDIR/video
 evaluation_FRAME.mp4, shows the first episode beside the expert's; --gif adds a GIF.
 """
 
+import pathlib
 import sys
+from typing import Any
 
 from absl import flags
 
@@ -26,14 +28,21 @@ def main(argv: list[str]) -> None:
     folder = workdir.from_flag(values.workdir)
 
     print(startup.prepare(), file=sys.stderr, flush=True)
+    from jaxil.training import trained
+
+    run = trained.load(folder)
+    with run.environment:
+        _evaluate(values, folder, run)
+
+
+def _evaluate(values: flags.FlagValues, folder: pathlib.Path, run: Any) -> None:
+    """Prints the returns of a `Trained` policy, and films its first episode."""
     from jaxil import config as jaxil_config
     from jaxil.demonstrations.states import DemonstrationError
     from jaxil.environments.evaluation import evaluate
-    from jaxil.files import video
     from jaxil.machine import screen
-    from jaxil.training import assembly, film, run_log, trained
+    from jaxil.training import assembly, film
 
-    run = trained.load(folder)
     films = assembly.renderer_name(run.config) != "none"
     evaluation = evaluate(
         run.environment,
@@ -59,16 +68,25 @@ def main(argv: list[str]) -> None:
             if not films:  # else the video says it
                 screen.say(f"without demonstrations: {error}")
     print(line)
-    if not films:
-        return
-    sides = film.sides(
-        run.config,
-        run.environment,
-        evaluation,
-        first_episode=_FIRST_EPISODE,
-        image_size=values.video_size,
-        shows_progress=True,
-    )
+    if films:
+        sides = film.sides(
+            run.config,
+            run.environment,
+            evaluation,
+            first_episode=_FIRST_EPISODE,
+            image_size=values.video_size,
+            shows_progress=True,
+        )
+        _write_videos(values, folder, run, sides)
+
+
+def _write_videos(
+    values: flags.FlagValues, folder: pathlib.Path, run: Any, sides: list[Any]
+) -> None:
+    """Writes `film.Side`s beside each other."""
+    from jaxil.files import video
+    from jaxil.training import run_log
+
     frames, captions = zip(*sides)
     stem = folder / "videos" / f"evaluation_{run.act.frame:09d}"
     fps = run_log.frames_per_second(len(frames[0]))

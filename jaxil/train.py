@@ -290,8 +290,9 @@ class Run(Parts):
             self.save()
 
     def close(self) -> None:
-        """Ends the line, the loggers, and the processes of several environments."""
+        """Ends the line and the loggers, and closes the environments."""
         with contextlib.ExitStack() as closing:
+            closing.callback(self.evaluator.close)
             if self.player is not None:
                 closing.callback(self.player.close)
             closing.callback(self.log.close)

@@ -1,5 +1,8 @@
 """Tasks of one's own that give what no agent can use: one message each."""
 
+import itertools
+import os
+import pathlib
 from typing import Any
 
 import dm_env
@@ -11,6 +14,8 @@ from jaxil.environments import tasks
 from jaxil.environments.pixel_environment import PixelEnvironment
 from tests.commands import call, small
 
+ROOT = pathlib.Path(__file__).parent.parent
+_NUMBERS = itertools.count()
 _BLACK = np.zeros((8, 8, 3), np.uint8)
 
 
@@ -170,6 +175,63 @@ def test_what_fails_while_it_is_recorded_is_one_message(
     assert ended.stderr.splitlines()[-1].startswith(words)
     assert "(test_own_task_faults.py, line " in ended.stderr
     assert not list(tmp_path.iterdir())
+
+
+class Counted(Task):
+    """Writes down when it is made and when it is closed."""
+
+    step_limit = 6
+
+    def __init__(self):
+        super().__init__()
+        self._number = next(_NUMBERS)
+        self._write("made")
+
+    def close(self):
+        self._write("closed")
+
+    def _write(self, word):
+        with open(os.environ["JAXIL_TEST_COUNTED"], "a") as file:
+            file.write(f"{word} {os.getpid()} {self._number}\n")
+
+
+def counted():
+    return Counted()
+
+
+def still(observation):
+    del observation
+    return np.zeros(1)
+
+
+@pytest.mark.parametrize("num_environments", [1, 2])
+def test_every_environment_is_closed(num_environments, tmp_path, monkeypatch):
+    """Own tasks may hold a server, a licence or a window."""
+    task, events = f"{__name__}:counted", tmp_path / "events"
+    monkeypatch.setenv("JAXIL_TEST_COUNTED", str(events))
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    run, trust = tmp_path / "run", f"--trust={task}"
+    train = (f"--config=drqv2:{task}", *small("drqv2"), f"--workdir={run}")
+    several = f"--config.num_environments={num_environments}"
+    output = f"--output={tmp_path / 'expert.npz'}"
+    commands = [
+        ("launch", *train, several),
+        ("evaluate", f"--workdir={run}", "--num_episodes=1", trust),
+        ("collect", f"--workdirs={run}", "--num_episodes=1", output, trust),
+    ]
+    if num_environments == 2:  # evaluation and recording take one
+        commands = commands[:1]
+    for command in commands:
+        ended = call(*command)
+        assert ended.returncode == 0, ended.stderr
+        made, closed = set(), set()
+        for line in events.read_text().splitlines():
+            word, _, which = line.partition(" ")
+            (made if word == "made" else closed).add(which)
+        assert closed == made, command
+    assert len({which.split()[0] for which in made}) == 1 + (
+        num_environments if num_environments > 1 else 0
+    )
 
 
 def begun(task):

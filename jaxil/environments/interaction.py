@@ -97,4 +97,4 @@ class Environments(Protocol):
         ...
 
     def close(self) -> None:
-        """Ends their processes."""
+        """Closes them and ends their processes."""

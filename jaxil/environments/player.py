@@ -44,7 +44,8 @@ class InProcess:
         )
 
     def close(self) -> None:
-        """Does nothing: the environment's owner closes it."""
+        """Closes the environment."""
+        self._environment.close()
 
 
 @dataclasses.dataclass
@@ -184,8 +185,9 @@ class Player:
         return finished
 
     def close(self) -> None:
-        """Ends the environments' processes."""
-        self._environments.close()
+        """Closes the environments."""
+        with told_as("the task", "close()"):
+            self._environments.close()
 
     def _order(self) -> list[int]:
         return sorted(self._open, key=lambda index: self._open[index].number)

@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 import struct
+import sys
 from collections.abc import Callable, Iterator
 from multiprocessing import resource_tracker
 from typing import Any
@@ -121,8 +122,10 @@ class Pool:
 
     def close(self) -> None:
         """Ends all processes."""
+        for worker in self._workers.values():
+            worker.dismiss()
         while self._workers:
-            self._workers.popitem()[1].close()
+            self._workers.popitem()[1].close(_EXIT_SECONDS)
 
 
 class _Worker:
@@ -165,24 +168,40 @@ class _Worker:
         self.has_answered, self.has_raised = True, isinstance(answer, str)
         return answer
 
-    def close(self) -> None:
-        """Kills the process, which has nothing to save."""
+    def dismiss(self) -> None:
+        """Tells the process to close its environment and end, without waiting."""
+        self._pipe.close()
+
+    def close(self, seconds: float = 0.0) -> None:
+        """Ends the process, which has so long to close its environment."""
+        self.dismiss()
+        self.process.join(seconds)
         self.process.kill()
         self.process.join(_EXIT_SECONDS)
-        self._pipe.close()
 
 
 def _serve(make: Callable[[], Any], pipe: Any) -> None:
     """Runs in the worker until the parent closes the pipe or ends."""
-    with contextlib.suppress(EOFError, ConnectionError):
+    try:
+        environment = InProcess(make())
+        for method, value in _requests(pipe):
+            getattr(environment, method)(0, value)
+            moment = environment.receive(0)
+            with contextlib.suppress(ConnectionError):
+                pipe.send(moment)
+        signal.alarm(round(_EXIT_SECONDS))  # kills a driver that hangs
+        environment.close()
+    except Exception as error:
         try:
-            environment = InProcess(make())
-            while True:
-                method, value = pipe.recv()
-                getattr(environment, method)(0, value)
-                pipe.send(environment.receive(0))
-        except (EOFError, ConnectionError):
-            raise  # the parent is gone
-        except Exception as error:
             pipe.send(raised(error))
-    os._exit(0)  # without cleanup, in which GL drivers may hang
+        except ConnectionError:
+            words = f"the task raised an error in close(): {raised(error)}"
+            print(words, file=sys.stderr, flush=True)
+    os._exit(0)  # without further cleanup, in which GL drivers may hang
+
+
+def _requests(pipe: Any) -> Iterator[tuple[str, Any]]:
+    """Yields what the parent asks for until it closes the pipe or ends."""
+    with contextlib.suppress(EOFError, ConnectionError):
+        while True:
+            yield pipe.recv()

@@ -128,13 +128,15 @@ def make_player(
 
     Args:
       config: checked.
-      environment: the training environment; several are made like it.
+      environment: the training environment, the player's from now on: it is closed if
+        there is none, or if several are made like it.
       first_episode: see `Player`.
       open_episodes: see `Player`.
       timed: wraps the environments, to measure their time.
       say: prints a line.
     """
     if not methods.get(config.method).plays:
+        environment.close()
         return None
     environments: Any = InProcess(environment)
     if config.num_environments > 1:
@@ -146,6 +148,7 @@ def make_player(
             seed=config.seed,
             **_environment_settings(config),
         )
+        environment.close()
         environments = Pool(make, config.num_environments, say=say)
     return Player(
         timed(environments), first_episode=first_episode, open_episodes=open_episodes

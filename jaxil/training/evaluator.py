@@ -8,6 +8,7 @@ import numpy as np
 from jaxil.config import Config
 from jaxil.environments.evaluation import Evaluation, Stopped, evaluate
 from jaxil.environments.pixel_environment import PixelEnvironment
+from jaxil.errors import told_as
 from jaxil.learner.state import TrainState
 from jaxil.maths.types import Episode, ExpertEpisodes
 from jaxil.training import film
@@ -107,6 +108,11 @@ class Evaluator:
         except Stopped:
             return None
         return Result(evaluation, distance, sides, filmed)
+
+    def close(self) -> None:
+        """Closes the environment."""
+        with told_as("the task", "close()"):
+            self.environment.close()
 
     def explain(self, state: TrainState, episode: Episode) -> dict[str, np.ndarray]:
         """Returns an episode's rewards and transport plan, for videos and reports.

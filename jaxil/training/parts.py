@@ -134,6 +134,7 @@ def make_parts(
         agent=agent,
         state=state,
         counters=counters,
+        episode_steps=environment.episode_steps,
         player=assembly.make_player(
             config,
             environment,
@@ -142,7 +143,6 @@ def make_parts(
             timed=functools.partial(TimedPool, stopwatch=stopwatch),
             say=say,
         ),
-        episode_steps=environment.episode_steps,
         replay=replay,
         updates=Updates(config, agent, replay, demonstrations, experts),
         experts=experts,

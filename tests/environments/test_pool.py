@@ -48,6 +48,9 @@ class Counting:
     def single_observation(self):
         return self._observation()[:1]
 
+    def close(self):
+        pass
+
     def _observation(self):
         return np.array([10 * self.episode + self.time, os.getpid()], np.float32)
 
