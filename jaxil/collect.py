@@ -200,10 +200,9 @@ def _inspect(values: flags.FlagValues) -> None:
     from jaxil.machine import memory
     from jaxil.machine.progress import shown
 
-    path = pathlib.Path(values.inspect)
-    if values.inspect in states.shipped_tasks() and not path.exists():
-        path = states.shipped_path(values.inspect)
-    with _reported(path, f"--inspect={path}"), shown("inspecting") as progress:
+    flag = f"--inspect={values.inspect}"
+    with _reported(values.inspect, flag), shown("inspecting") as progress:
+        path = states.located(values.inspect)
         seen = inspection.inspect(
             path,
             progress=progress,
@@ -259,7 +258,7 @@ def _convert(values: flags.FlagValues) -> None:
 
 
 @contextlib.contextmanager
-def _reported(path: pathlib.Path, flags_given: str) -> Iterator[None]:
+def _reported(path: pathlib.Path | str, flags_given: str) -> Iterator[None]:
     """Turns errors of a user's file into a UsageError."""
     from jaxil.demonstrations.states import DemonstrationError
 

@@ -65,7 +65,8 @@ FIELDS: dict[str, Field] = {
     "reward_refresh_steps": Field(
         0,
         "agent steps between two recomputations of all stored rewards, at an episode's "
-        "end; 0, as in the paper: an episode keeps its first rewards",
+        "end; 0, as in the paper: episodes keep their first rewards. Without effect "
+        "if a method's rewards never change",
         0,
         10**9,
     ),

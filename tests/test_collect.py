@@ -114,6 +114,8 @@ def test_states_become_pixels_that_serve_as_the_states_do(few, tmp_path, capsys)
     output = tmp_path / "pixels.npz"
     call("--convert", few, output, *SIZES)
     assert "2 episodes of jaxil states" in capsys.readouterr().out
+    call(f"--inspect={output}", f"--output={tmp_path}")
+    assert "origin: jaxil states" in capsys.readouterr().out
     settings = {
         "task": "cartpole_swingup",
         "num_episodes": 2,
@@ -157,7 +159,8 @@ def test_pixels_keep_their_size_unless_another_is_asked_for(tmp_path):
         (["--convert=a", "--output=."], "is a folder"),
         (["--convert=a.npz", "--output=./a.npz"], "is the file to convert"),
         (["--workdirs=a", "--output=/proc/x.npz"], "cannot be written"),
-        (["--inspect=none.npz"], "none.npz cannot be read"),
+        (["--inspect=none.npz"], "none.npz: no such file or folder, and no task"),
+        (["--inspect=my:make"], "demonstrations; these are acrobot_swingup, ball"),
         (["--inspect=setup.cfg"], "in an unsupported format"),
         (["--inspect=setup.cfg", "--output=setup.cfg"], "must be a folder"),
         (["--convert=setup.cfg", "--output=x.npz"], "in an unsupported format"),

@@ -191,7 +191,7 @@ class Counted(Task):
         self._write("closed")
 
     def _write(self, word):
-        with open(os.environ["JAXIL_TEST_COUNTED"], "a") as file:
+        with pathlib.Path(os.environ["JAXIL_TEST_COUNTED"]).open("a") as file:
             file.write(f"{word} {os.getpid()} {self._number}\n")
 
 

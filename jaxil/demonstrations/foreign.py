@@ -120,6 +120,7 @@ def open_recording(
     return recording._replace(
         episodes=_fitted(items, stride, options),
         task=recording.task and printable(recording.task),
+        origin=recording.origin and printable(recording.origin, 200),
         action_repeat=repeat and round(repeat * stride),
         frames_per_second=speed and speed / stride,
         notes=tuple(printable(note, 200) for note in recording.notes),

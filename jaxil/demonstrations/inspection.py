@@ -109,6 +109,8 @@ def inspect(
         "action repeat": str(recording.action_repeat or "unknown"),
         "frames per second": "unknown" if fps is None else f"{fps:g}",
     }
+    if recording.origin:
+        facts["origin"] = recording.origin
     if height != width:
         facts["shape"] = (
             "not square: demonstrations.fit=stretch (the default), crop or pad"

@@ -126,6 +126,22 @@ def shipped_path(task: str) -> pathlib.Path:
     return path
 
 
+def located(name: str) -> pathlib.Path:
+    """Returns the path of a file or folder, or of a task's shipped demonstrations.
+
+    Raises DemonstrationError if there is neither.
+    """
+    path = pathlib.Path(name)
+    if path.exists():
+        return path
+    if name in shipped_tasks():
+        return shipped_path(name)
+    raise DemonstrationError(
+        f"{printable(name)}: no such file or folder, and no task with shipped "
+        f"demonstrations; these are {', '.join(shipped_tasks())}"
+    )
+
+
 def digest(path: pathlib.Path) -> str:
     """Returns a digest of the content of a file or folder, whatever its name.
 

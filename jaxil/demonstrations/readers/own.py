@@ -72,7 +72,7 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
     yield Recording(
         kind="jaxil pixels",
         num_episodes=num_episodes,
-        notes=(f"Origin: {metadata['origin']}.",),
+        origin=metadata["origin"],
         **{name: metadata[name] for name in _OPTIONAL},
     )
     for index in range(num_episodes):

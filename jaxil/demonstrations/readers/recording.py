@@ -65,6 +65,7 @@ class Recording(NamedTuple):
     task: str | None = None  # `domain_task`
     action_repeat: int | None = None  # environment frames per stored step
     frames_per_second: float | None = None  # of the stored frames
+    origin: str | None = None  # where it comes from, in words
     notes: tuple[str, ...] = ()  # warnings for the user, as whole sentences
 
 
