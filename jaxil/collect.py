@@ -10,15 +10,16 @@ are not dm_control's, it holds pixels.
     jaxil collect --policy=package.module:function --task=gymnasium:ID \
         --output=FILE.npz
 
-records a function of the task's own observation, a flat vector, that returns an action
-with all numbers in [-1, 1].
+records a function of the task's own observation, a flat vector or else the image, that
+returns an action with all numbers in [-1, 1].
 
-    jaxil collect --inspect=FILE
+    jaxil collect --inspect=FILE_OR_TASK
     jaxil collect --convert=IN --output=OUT.npz
 
 summarise a file of any format, with a contact sheet and a video, and convert it to
 jaxil's format of pixels. Formats: jaxil states or pixels, ROT or PatchAIL pickles,
-folders of DrQ-v2 or V-D4RL episodes, videos, Minari and LeRobot v3 datasets.
+folders of DrQ-v2 or V-D4RL episodes, videos, folders of PNG or JPEG frames, `.npy`,
+Minari and LeRobot v3 datasets.
 """
 
 import contextlib

@@ -90,7 +90,11 @@ FIELDS: dict[str, Field] = {
     "feature_dim": Field(50, "width of the trunks; 50 in the paper", 1, 10**5),
     "hidden_dim": Field(1024, "of actor and critic; 1024 in the paper", 1, 10**5),
     "critic_target_tau": Field(
-        0.01, "share of the new critic in its target; 0.01", 0, 1, positive=True
+        0.01,
+        "share of the new critic in its target; 0.01 in DrQ-v2",
+        0,
+        1,
+        positive=True,
     ),
     "policy_tau": Field(
         1.0,
@@ -99,9 +103,9 @@ FIELDS: dict[str, Field] = {
         1,
         positive=True,
     ),
-    "noise_clip": Field(0.3, "of exploration noise in updates; 0.3", 0.0, 2.0),
-    "exploration_std_start": Field(1.0, "1 in the paper", 0.0, 10.0),
-    "exploration_std_end": Field(0.1, "0.1 in the paper", 0.0, 10.0),
+    "noise_clip": Field(0.3, "of the noise in updates; 0.3 in DrQ-v2", 0.0, 2.0),
+    "exploration_std_start": Field(1.0, "of the noise; 1 in the paper", 0.0, 10.0),
+    "exploration_std_end": Field(0.1, "its last; 0.1 in the paper", 0.0, 10.0),
     "exploration_std_steps": Field(
         500_000, "agent steps from start to end; 500000 in the paper", 1, 10**9
     ),
@@ -139,8 +143,10 @@ FIELDS: dict[str, Field] = {
         "float32", "of convolutions and trunks", choices=("float32", "bfloat16")
     ),
     # Looking at it.
-    "eval_every_frames": Field(10_000, "10000 in DrQ-v2", 1, 10**10),
-    "num_eval_episodes": Field(10, "10 in DrQ-v2", 1, 10**4),
+    "eval_every_frames": Field(
+        10_000, "between two evaluations; 10000 in DrQ-v2", 1, 10**10
+    ),
+    "num_eval_episodes": Field(10, "in an evaluation; 10 in DrQ-v2", 1, 10**4),
     "checkpoint_every_frames": Field(10_000, "most that a kill loses", 1, 10**10),
     "video_every_evals": Field(5, "0 turns videos off", 0, 10**6),
     "logger": Field(

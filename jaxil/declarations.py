@@ -64,8 +64,8 @@ class Method(NamedTuple):
       uses_demonstrations: whether it imitates anything.
       sees_actions: whether it reads the expert's actions, or the field that decides.
       plays: whether the agent acts in the environment; a method that does not learns
-        from demonstrations alone, and an update counts as the frames that an agent
-        would play for it.
+        from demonstrations alone, and each update counts as the frames that other
+        methods play per update.
       total_updates: length of a run of a method that does not play.
       needs_pixels: whether it cannot learn from state vectors.
       metrics: columns of train.csv beside those of the learner, such as "own/error".

@@ -49,7 +49,9 @@ PDAC_DISCRIMINATOR = {
 }
 CLONING = {
     "batch_size": Field(128, "expert samples; 128 in ROT", 1, 65_536),
-    "std": Field(0.1, "of the policy whose likelihood is raised; 0.1", 1e-6, 10.0),
+    "std": Field(
+        0.1, "of the policy whose likelihood is raised; 0.1 in ROT", 1e-6, 10.0
+    ),
 }
 # Beside these stand another method's sections. All fields are keyword arguments of one
 # function, so no name may occur twice.

@@ -19,7 +19,7 @@ from jaxil.training.parts import Parts, make_parts
 from jaxil.training.run_log import as_floats
 
 # NumPy's random streams. Numbers are keyed by (seed, stream, step), so a resumed run
-# repeats those of an unbroken one without a stored state.
+# repeats those of an uninterrupted one without a stored state.
 _UNIFORM_ACTIONS, _SAMPLED_BATCHES = 1, 2
 _EXPLORATION_KEY = 2**32 - 2  # a fold_in number that no update has
 

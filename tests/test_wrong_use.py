@@ -1,5 +1,6 @@
 """Each wrong use ends with status 2 and one message: field, value, rule, way out."""
 
+import contextlib
 import types
 
 import numpy as np
@@ -178,7 +179,7 @@ def test_a_folder_without_a_run_is_said(name, tmp_path):
 def test_a_video_that_cannot_be_written_costs_no_returns(tmp_path, monkeypatch):
     run = types.SimpleNamespace(
         config=jaxil_config.default_config("zero"),
-        environment=None,
+        environment=contextlib.nullcontext(),
         act=types.SimpleNamespace(frame=2000),
     )
     played = evaluation.Evaluation([], np.array([3.0]), [])

@@ -82,7 +82,7 @@ class Moment(NamedTuple):
 
 
 class Environments(Protocol):
-    """Several environments that run in the background."""
+    """One environment or several, which step until `receive` is called."""
 
     size: int  # how many there are
 

@@ -3,7 +3,6 @@
 No other module imports dm_control.
 """
 
-import difflib
 import functools
 import importlib.metadata
 import logging
@@ -17,6 +16,7 @@ import numpy as np
 from jaxil.environments.camera import RENDER_QUALITIES, Renderer
 from jaxil.environments.distraction import STRENGTHS, Distraction
 from jaxil.environments.pixel_environment import PixelEnvironment, flat_state
+from jaxil.errors import unknown_name
 from jaxil.machine import startup
 
 OBSERVATIONS = ("pixels", "state")
@@ -63,13 +63,7 @@ def split_task(task: str) -> tuple[str, str]:
     for domain, name in _suite().ALL_TASKS:
         if task == f"{domain}_{name}":
             return domain, name
-    close = difflib.get_close_matches(task, known_tasks(), n=3, cutoff=0.5)
-    same_domain = [known for known in known_tasks() if known.startswith(task)]
-    advice = close or same_domain[:3] or ["cartpole_swingup", "walker_walk"]
-    raise ValueError(
-        f"task={task!r} is not a task of the control suite; write domain_task, "
-        f"for example {', '.join(advice)}."
-    )
+    raise ValueError(str(unknown_name("task", task, known_tasks())))
 
 
 def camera_of(task: str) -> int:

@@ -1,1 +1,1 @@
-"""Floor 2: the learner's state, its one update step, and the policy it yields."""
+"""The learner's state, its one update step, and the policy it yields."""

@@ -49,10 +49,10 @@ class AgentView(NamedTuple):
     The last three are None unless the method has `samples_successors`.
 
     Attributes:
-      observation: augmented pixels. Shape [B, H, W, C].
+      observation: augmented pixels [B, H, W, C], or states [B, S].
       features: critic trunk features of `observation`, without gradient. Shape [B, D].
       action: shape [B, A].
-      unshifted: the pixels as stored. Shape [B, H, W, C].
+      unshifted: the same as stored, without augmentation.
       successor: the observations one step later, augmented. Like `observation`.
       successor_features: features of `successor`. Like `features`.
       unshifted_successor: successors as stored, for methods that shift an observation
@@ -92,11 +92,11 @@ def _no_state(key: Array, spec: Spec, learner: LearnerParams) -> RewarderState:
 def _keep(
     state: RewarderState,
     learner: LearnerParams,
-    agent: AgentView,
+    view: AgentView,
     expert: ExpertBatch | None,
     key: Array,
 ) -> tuple[RewarderState, Metrics]:
-    del learner, agent, expert, key
+    del learner, view, expert, key
     return state, {}
 
 
@@ -118,7 +118,7 @@ class Rewarder(NamedTuple):
         belongs to the transition from observation t to observation t + 1.
       init: (key, spec, learner) -> state: what the method learns or remembers;
         `learner` is for methods that start as a copy of live networks.
-      update: (state, learner, agent, expert, key) -> (state, metrics). Traced inside
+      update: (state, learner, view, expert, key) -> (state, metrics). Traced inside
         the learner's update step, on parameters from before that step.
       observe: (state, learner, episode, expert_episodes) -> state. Called once for
         each episode, at its end and before it is rewarded.
@@ -135,9 +135,9 @@ class Rewarder(NamedTuple):
       relabel: (state, learner, batch) -> rewards [B, n], for methods that reward each
         batch by the current state; `batch` has its window. None where rewards are
         stored.
-      rewards_changed: state -> whether an episode rewarded before the last `observe`
-        would get other rewards now. None where stored rewards never change.
-      actor_loss: (state, learner, agent, expert, key) -> scalar, added to the actor's
+      rewards_changed: state -> whether rewards from before the last `observe` are
+        stale. None where stored rewards never change.
+      actor_loss: (state, learner, view, expert, key) -> scalar, added to the actor's
         loss and differentiated with respect to `learner.actor`; encoder and critic are
         those after this update's step. None if there is no such term.
       plan: (state, learner, episode, expert_episodes) -> the transport plan

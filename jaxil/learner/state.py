@@ -15,7 +15,7 @@ class LearnerParams(NamedTuple):
     """The parameters that rewarders and policies may read.
 
     Attributes:
-      encoder: shared pixel encoder.
+      encoder: of pixels, shared by actor and critic.
       actor: policy.
       critic: live twin critics.
     """
@@ -52,7 +52,8 @@ class TrainState(struct.PyTreeNode):
       target_critic: slow copy of the critic's parameters.
       rewarder: what the imitation method learns or remembers.
       key: base random key. Never consumed: update number n uses
-        `fold_in(key, n)`, so a resumed run has the random numbers of an unbroken one.
+        `fold_in(key, n)`, so a resumed run has the random numbers of an
+        uninterrupted one.
       num_updates: gradient steps so far. Shape [], int32.
       average: of all policies so far, see `averaging.average_policy`; None where the
         newest is evaluated.

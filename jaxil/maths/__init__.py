@@ -1,1 +1,1 @@
-"""Floor 0: pure functions on arrays. No networks, no files, no clocks."""
+"""Pure functions on arrays. No networks, no files, no clocks."""

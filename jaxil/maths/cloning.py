@@ -49,7 +49,8 @@ def q_filter(label_values: Array, policy_values: Array) -> Array:
       policy_values: both critics on the policy's actions. Shape [2, B].
 
     Source: the Q-filter of Nair et al. 2018, arXiv:1709.10089, with the smaller of two
-    critics. ROT (siddhanthaldar/ROT) takes the mean of such a filter over a batch.
+    critics. ROT (siddhanthaldar/ROT) has one number for a batch instead: how often the
+    critic prefers a cloned policy's action to the agent's, on the agent's observations.
     """
     chex.assert_rank([label_values, policy_values], 2)
     chex.assert_equal_shape([label_values, policy_values])

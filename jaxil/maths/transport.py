@@ -45,7 +45,7 @@ def euclidean_cost(x: Array, y: Array) -> Array:
 def simultaneous_plan(cost: Array, agent_mass: Array, expert_mass: Array) -> Array:
     """Returns the plan [T, N] that pairs step t with step t, without transport.
 
-        P_tn = a_t  for  n = min(t, number of expert steps - 1),  else 0
+        P_tn = a_t  for  n = min(t, number of expert moments - 1),  else 0
 
     Only the shape of `cost` is used. Masses are 0 beyond an episode's own steps.
 

@@ -63,7 +63,7 @@ def actor_features(
     actor_params: Params,
     observation: Array,
 ) -> Array:
-    """Returns the features of the actor's trunk: [B, H, W, C] to [B, D]."""
+    """Returns the features of the actor's trunk: [B, H, W, C] or [B, S] to [B, D]."""
     representation = apply(networks.encoder, encoder_params, observation)
     actor = networks.actor
     return apply(actor, actor_params, representation, method=actor.features)
@@ -75,7 +75,7 @@ def critic_features(
     critic_params: Params,
     observation: Array,
 ) -> Array:
-    """Returns the features of the critic's trunk: [B, H, W, C] to [B, D]."""
+    """Returns the features of the critic's trunk: [B, H, W, C] or [B, S] to [B, D]."""
     representation = apply(networks.encoder, encoder_params, observation)
     critic = networks.critic
     return apply(critic, critic_params, representation, method=critic.features)

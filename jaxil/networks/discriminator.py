@@ -32,7 +32,7 @@ class Embedding(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Array) -> Array:
-        """Maps [B, H, W, C] to [B, D], in [-1, 1]."""
+        """Maps [B, H, W, C] or [B, S] to [B, D], in [-1, 1]."""
         return Trunk(self.feature_dim)(self.encoder(observation))
 
 
@@ -48,7 +48,7 @@ class PixelDiscriminator(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Array, action: Array) -> Array:
-        """Maps [B, H, W, C] and [B, A] to logits [B]."""
+        """Maps [B, H, W, C] or [B, S], and [B, A], to logits [B]."""
         features = Embedding(self.encoder, self.feature_dim)(observation)
         inputs = jnp.concatenate([features, action], axis=-1)
         return Discriminator(self.hidden_dim)(inputs)
@@ -63,7 +63,7 @@ class TransitionDiscriminator(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Array, successor: Array) -> Array:
-        """Maps two arrays [B, H, W, C] to logits [B]."""
+        """Maps two arrays [B, H, W, C] or [B, S] to logits [B]."""
         embed = Embedding(self.encoder, self.feature_dim)
         features = [embed(observation), embed(successor)]
         return Discriminator(self.hidden_dim)(jnp.concatenate(features, axis=-1))

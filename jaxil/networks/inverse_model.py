@@ -24,7 +24,7 @@ class InverseModel(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Array, successor: Array) -> Array:
-        """Maps two arrays [B, H, W, C] to actions [B, A], in [-1, 1]."""
+        """Maps two arrays [B, H, W, C] or [B, S] to actions [B, A], in [-1, 1]."""
         embed = Embedding(self.encoder, self.feature_dim)
         features = [embed(observation), embed(successor)]
         mlp = MLP(self.hidden_dim, self.action_dim)
@@ -46,7 +46,10 @@ class InverseModels(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Array, successor: Array) -> Array:
-        """Maps two arrays [B, H, W, C] to M models' actions [M, B, A], in [-1, 1]."""
+        """Maps two arrays [B, H, W, C] or [B, S] to M models' actions [M, B, A].
+
+        These are in [-1, 1].
+        """
         embed = Embedding(self.encoder, self.feature_dim)
         features = [embed(observation), embed(successor)]
         shared: Any = None  # flax accepts it, but its types say numbers only

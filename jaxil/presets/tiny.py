@@ -15,9 +15,9 @@ shadows. Other deviations from the paper:
   (`policy_tau`), since the newest policy is worse at times. Training never uses the
   average.
 - Exploration ends sooner, the agent updates every step and learning rates are higher,
-  since runs have to be short. Exploration ends soonest on finger_spin: training returns
-  at 60k frames on state vectors were 292 with one seed, and 175, 122 and 262 with the
-  preset's usual length.
+  since runs have to be short, and sooner still on finger_spin: training returns at 60k
+  frames on state vectors were 292 with one seed, and 175, 122 and 262 with the preset's
+  usual length. In P-DAC's short runs on the cup it ends after 20k frames.
 - The replay is smaller, so that its rewards are newer, and they are recomputed
   (`reward_refresh_steps`): those of the first episodes come from an untrained
   discriminator and would teach the critic that random behaviour is best.
@@ -31,8 +31,8 @@ shadows. Other deviations from the paper:
 - On ball_in_cup_catch P-DAC updates four times after each step. Its three seeds reached
   80 % of the expert at 20k, 30k and 50k frames; with one update three of five did, at
   40k to 80k, in about the same time.
-- On ball_in_cup_catch the other methods repeat actions 4 times, which needs half the
-  time for as many frames. P-SIL's rewards stay as they were stored there: with rewards
+- On ball_in_cup_catch the other methods repeat actions 4 times, which halves the
+  time per frame. P-SIL's rewards stay as they were stored there: with rewards
   recomputed one of nine runs reached 80 % of the expert within 71k to 202k frames, and
   with stored ones all of eight did within 80k to 180k.
 - cartpole_swingup is seen by the camera that follows the cart. DrQ-v2's shows the pole

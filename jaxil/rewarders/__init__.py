@@ -1,1 +1,1 @@
-"""Floor 2: imitation methods, one file each, behind `rewarder.Rewarder`."""
+"""Imitation methods, one file each, behind `rewarder.Rewarder`."""

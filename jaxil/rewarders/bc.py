@@ -1,7 +1,7 @@
 """Behavioural cloning, a baseline: the policy copies the expert's actions.
 
-The agent never acts in the environment; an update counts as the frames that another
-method would play for it.
+The agent never acts in the environment; each update counts as the frames that other
+methods play per update.
 """
 
 import chex

@@ -37,7 +37,7 @@ METHOD = methods.Method(
     metrics=methods.DISCRIMINATOR_METRICS,
 )
 
-Inputs = tuple[Array, Array]  # pixels in [0, 1], float [B, H, W, C]; actions [B, A]
+Inputs = tuple[Array, Array]  # pixels [B, H, W, C], or states [B, S]; actions [B, A]
 
 
 def make_rewarder(

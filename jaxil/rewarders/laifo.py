@@ -65,8 +65,10 @@ def make_rewarder(
 
     Source: Giammarino et al. 2024, Adversarial Imitation Learning from Visual
     Observations using Latent Information, arXiv:2309.17371, and its code,
-    VittorioGiammarino/AIL_from_visual_obs. There, actor and critic share one trunk,
-    and an n-step return judges one transition over all n steps; here, each single step.
+    VittorioGiammarino/AIL_from_visual_obs. There, actor and critic share one trunk, an
+    n-step return judges one transition over all n steps, the penalty is on the decision
+    and rewards are of augmented observations; here each single step is judged, the
+    penalty is on the logit and rewards are of observations as they are.
     """
     discriminator = Discriminator(hidden_dim)
 

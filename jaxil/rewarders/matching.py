@@ -18,12 +18,13 @@ class Matching(NamedTuple):
     """How two episodes are compared: what a pair of moments costs, which are paired.
 
     Attributes:
-      cost: features [T, D] and [N, D] to costs [T, N].
+      cost: features [T, D] and [N, D] and how many of T and of N are not padding, to
+        costs [T, N].
       plan: costs [T, N] and masses of the agent's moments [T] and the expert's [N] to a
         plan [T, N], whose rows have exactly the agent's masses.
     """
 
-    cost: Callable[[Array, Array], Array]
+    cost: Callable[[Array, Array, Array, Array], Array]
     plan: Callable[[Array, Array, Array], Array]
 
     def rewards(
@@ -60,7 +61,7 @@ class Matching(NamedTuple):
         agent_mass = transport.uniform_mass(agent_moments, len(agent))
 
         def match(expert: Array, num_moments: Array) -> tuple[Array, Array]:
-            cost = self.cost(agent, expert)
+            cost = self.cost(agent, expert, agent_moments, num_moments)
             expert_mass = transport.uniform_mass(num_moments, len(expert))
             return cost, self.plan(cost, agent_mass, expert_mass)
 
@@ -137,4 +138,6 @@ def make_matching(
         "euclidean": transport.euclidean_cost,
     }
     plans = {"transport": sinkhorn, "time": transport.simultaneous_plan}
-    return Matching(costs[cost], plans[alignment])
+    return Matching(
+        lambda agent, expert, *moments: costs[cost](agent, expert), plans[alignment]
+    )

@@ -87,7 +87,8 @@ def make_rewarder(
         bonus      r_t = 0.5 m_t + s_t
 
     where s_t is lambda times `patch_similarity`, and lambda makes the first episode's
-    mean s 1.3 (weighted) or 0.5 (bonus). The penalty is on the mean logit.
+    mean s 1.3 (weighted) or 0.5 (bonus). The penalty is on the mean logit as a function
+    of pixels in [0, 1]; the authors' is on the sum of logits, of pixels in [0, 255].
 
     Args:
       agent: its frame stack and shift are used.

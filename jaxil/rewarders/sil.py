@@ -170,10 +170,8 @@ def batch_distance(matching: Matching, agent: Array, expert: Array) -> Array:
       expert: shape [B, D].
     """
     chex.assert_rank([agent, expert], 2)
-    cost = matching.cost(agent, expert)
-    masses = (
-        transport.uniform_mass(jnp.asarray(len(batch)), len(batch))
-        for batch in (agent, expert)
-    )
+    sizes = [jnp.asarray(len(batch)) for batch in (agent, expert)]
+    cost = matching.cost(agent, expert, *sizes)
+    masses = map(transport.uniform_mass, sizes, cost.shape)
     plan = matching.plan(jax.lax.stop_gradient(cost), *masses)
     return jnp.sum(cost * jax.lax.stop_gradient(plan))

@@ -3,14 +3,13 @@
 import functools
 
 import chex
-import jax
 import jax.numpy as jnp
 from jax import Array
 
 from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, Rewarder
 from jaxil.maths import transport
-from jaxil.rewarders.matching import cheapest, closest_rewards
+from jaxil.rewarders.matching import Matching
 from jaxil.rewarders.targets import make_target_rewarder
 
 METHOD = methods.Method(
@@ -67,40 +66,27 @@ def make_rewarder(
     Reward, on the features of P-SIL; the paper's are those of a frozen ResNet.
     """
 
-    def match(
-        agent: Array, agent_moments: Array, experts: Array, expert_moments: Array
-    ) -> tuple[Array, Array]:
-        agent_mass = transport.uniform_mass(agent_moments, len(agent))
+    def cost(
+        agent: Array, expert: Array, agent_moments: Array, expert_moments: Array
+    ) -> Array:
+        return context_cost(
+            transport.cosine_cost(agent, expert),
+            agent_moments,
+            expert_moments,
+            context_length=context_length,
+        )
 
-        def match_one(expert: Array, num_moments: Array) -> tuple[Array, Array]:
-            cost = context_cost(
-                transport.cosine_cost(agent, expert),
-                agent_moments,
-                num_moments,
-                context_length=context_length,
-            )
-            plan = band_plan(
-                cost,
-                agent_mass,
-                transport.uniform_mass(num_moments, len(expert)),
-                band_steps=band_steps,
-                epsilon=epsilon,
-                num_iterations=num_iterations,
-            )
-            return cost, plan
-
-        return jax.vmap(match_one)(experts, expert_moments)
-
-    def rewards(*features_and_moments: Array) -> Array:
-        return closest_rewards(*match(*features_and_moments))
-
-    def plan(*features_and_moments: Array) -> tuple[Array, Array]:
-        return cheapest(*match(*features_and_moments))
-
+    plan = functools.partial(
+        band_plan,
+        band_steps=band_steps,
+        epsilon=epsilon,
+        num_iterations=num_iterations,
+    )
+    matching = Matching(cost, plan)
     return make_target_rewarder(
         agent,
-        compare=rewards,
-        plan=plan,
+        compare=matching.rewards,
+        plan=matching.closest_plan,
         target_update_steps=target_update_steps,
         return_scale=return_scale,
     )

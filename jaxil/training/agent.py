@@ -48,11 +48,11 @@ class Agent(NamedTuple):
       observe: (rewarder state, learner, episode, expert episodes) -> state, the
         rewarder's; the episode is a whole one, without padding.
       rewards: the same arguments -> the rewarder's rewards, a NumPy array [T].
+      plan: the same arguments -> the rewarder's plan, a NumPy array [T + 1, N + 1],
+        and the index of its demonstration; None where it has none.
       compiled_length: (T) -> the length for which `observe`, `rewards`, `plan` and
         `refresh` of an episode of T steps are compiled.
       refresh: rewards of stored episodes as of now, see `rewarder.make_refresh`.
-      plan: the same arguments -> the rewarder's plan, a NumPy array [T + 1, N + 1],
-        and the index of its demonstration; None where it has none.
       rewarder: the method itself.
       mean_image: what the encoder subtracts, where that is the demonstrations' mean
         image; None otherwise.

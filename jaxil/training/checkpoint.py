@@ -243,7 +243,7 @@ class Checkpoints:
             self._say(
                 f"{len(faults)} damaged episodes are left out of the replay "
                 f"({'; '.join(faults[:3])}{more}): what follows differs from an "
-                "unbroken run"
+                "uninterrupted run"
             )
         # Checkpoints of earlier versions lack this file, or the number of steps of a
         # lost episode: the rewards in the episodes' files are used then.

@@ -308,7 +308,7 @@ def test_cameras_are_those_of_drqv2():
     [
         ({"task": "cartpole_swing"}, "cartpole_swingup"),
         ({"task": "walker"}, "walker_"),
-        ({"task": ""}, "domain_task"),
+        ({"task": ""}, "choose one of: acrobot_swingup"),
         ({"render_quality": "best"}, "paper, fast"),
         ({"image_size": 0}, "image_size=0 must be at least 1"),
         ({"action_repeat": 0}, "action_repeat=0 must be at least 1"),
