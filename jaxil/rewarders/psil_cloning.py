@@ -3,7 +3,7 @@
 from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, Rewarder
 from jaxil.rewarders import psil
-from jaxil.rewarders.pseudo_actions import with_cloning
+from jaxil.rewarders.inferred_actions import with_cloning
 
 METHOD = methods.Method(
     name="psil_cloning",

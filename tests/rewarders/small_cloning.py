@@ -10,7 +10,7 @@ from jaxil.learner.rewarder import AgentSpec, AgentView, Spec
 from jaxil.learner.update import init_train_state
 from jaxil.maths.types import Batch, ExpertBatch
 from jaxil.rewarders import pdac, pdac_cloning, psil, psil_cloning
-from jaxil.rewarders.pseudo_actions import with_cloning
+from jaxil.rewarders.inferred_actions import with_cloning
 from tests.rewarders.small_world import SIDE, STATE_DIM, learner_with
 from tests.tiny_agent import make_tiny_networks, random_actions
 

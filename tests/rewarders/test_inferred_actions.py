@@ -14,7 +14,7 @@ from jaxil.learner.update import make_update_step
 from jaxil.maths import cloning
 from jaxil.networks.agent import apply
 from jaxil.networks.inverse_model import InverseModels
-from jaxil.rewarders.pseudo_actions import with_cloning
+from jaxil.rewarders.inferred_actions import with_cloning
 from jaxil.rewarders.zero import zero_rewards
 from tests.rewarders.small_cloning import (
     BATCH,

@@ -2,7 +2,7 @@
 
 Inverse models learn from the agent's own play which action leads from one observation
 to the next, as in BCO, and infer the actions of the expert's video. The actor then
-follows rewards and, as far as those pseudo-actions are trusted, copies them.
+follows rewards and, as far as those inferred actions are trusted, copies them.
 """
 
 from typing import Any
@@ -67,7 +67,7 @@ def with_cloning(
     head_dim: int,
     model_learning_rate: float,
 ) -> Rewarder:
-    """Returns a rewarder with the same rewards, whose actor also clones pseudo-actions.
+    """Returns a rewarder with the same rewards; its actor also clones inferred actions.
 
         min_g   mean_m mean_t |g_m(o_t, o_{t+1}) - a_t|^2      over the agent's samples
         L_actor = ... + weight s mean_t w_t |pi(e_t) - mean_m g_m(e_t, e_{t+1})|^2
@@ -85,7 +85,7 @@ def with_cloning(
     Args:
       rewarder: the inner method.
       agent: its networks say what encoder and embedding the inverse models have.
-      num_pairs: expert transitions whose pseudo-actions are cloned in an update.
+      num_pairs: expert transitions whose inferred actions are cloned in an update.
       weight: of the term.
       trust: "agreement": `cloning.agreement_trust`; "q_filter": `cloning.q_filter`,
         by the critic that the actor's loss uses; "none": 1.
@@ -95,7 +95,7 @@ def with_cloning(
       head_dim: width of their separate heads.
       model_learning_rate: of their Adam.
 
-    Source: Torabi et al. 2018, arXiv:1805.01954, for pseudo-actions; ROT
+    Source: Torabi et al. 2018, arXiv:1805.01954, for inferred actions; ROT
     (siddhanthaldar/ROT), where the expert's actions are known, for cloning beside
     imitation rewards. The combination is this project's own.
     """
@@ -120,7 +120,7 @@ def with_cloning(
         return view, _first_rows(expert, rewarder.expert_batch_size)
 
     def infer(params: Params, expert: ExpertBatch) -> Array:
-        """Returns each model's pseudo-actions, [M, B, A]."""
+        """Returns each model's inferred actions, [M, B, A]."""
         pairs = _first_rows(expert, num_pairs)
         return apply(models, params, pairs.observation, pairs.successor)
 
