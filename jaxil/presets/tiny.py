@@ -50,28 +50,54 @@ shadows. Other deviations from the paper:
   the smaller penalty one seed had 843 of 856 at 280k frames, without them 373 at 300k.
 """
 
+from typing import Any
+
 from jaxil import config as jaxil_config
 from jaxil import methods
 from jaxil.errors import Fault, UsageError
 
-_ACTION_REPEATS = {"cartpole_swingup": 4, "ball_in_cup_catch": 4}
-_ACTION_REPEATS_OF_PDAC = _ACTION_REPEATS | {"ball_in_cup_catch": 2}
-_CAMERAS = {"cartpole_swingup": "lookatcart"}
-_GRADIENT_PENALTIES = {("pdac", "cartpole_swingup"): 1.0}
-# Frames of a run, and agent steps over which learning rates fall.
-_FALLING_RATES = {
-    "cartpole_swingup": (300_000, 75_000),
-    "finger_spin": (400_000, 125_000),
-    "walker_walk": (700_000, 250_000),
+_ALL = {
+    "action_repeat": 2,
+    "total_frames": 500_000,
+    "image_size": 48,
+    "render_quality": "fast",
+    "encoder": {
+        "channels": (32, 32, 32),
+        "kernel_sizes": (4, 3, 3),
+        "strides": (4, 1, 1),
+        "contrast": 4.0,
+        "subtract_mean_image": True,
+    },
+    "shift_padding": 2,
+    "hidden_dim": 256,
+    "batch_size": 64,
+    "update_every_steps": 1,
+    "learning_rate": 3e-4,
+    "pre_tanh_penalty": 2e-3,
+    "policy_tau": 1e-3,
+    "replay_size_steps": 50_000,
+    "replay_on_device": True,  # also on CPUs, where XLA stacks faster than NumPy
+    "exploration_std_steps": 50_000,
+    "reward_refresh_steps": 2_500,
+    "eval_every_frames": 20_000,
+    "checkpoint_every_frames": 10_000,
 }
-_FALLING_RATES_OF_PSIL = _FALLING_RATES | {"cartpole_swingup": (300_000, 150_000)}
-_WALKERS = ("walker_stand", "walker_walk", "walker_run")
-_SMALL_PENALTY_OF_PSIL = (*_WALKERS, "finger_spin", "cartpole_swingup")
-_JUDGED_BY_COMPONENTS = {
-    "pdac": (*_WALKERS, "finger_spin"),
-    "psil": ("walker_walk", "finger_spin"),
+# Where actions are repeated more often, there are fewer agent steps in as many frames.
+_REPEATED = {
+    "exploration_steps": 500,
+    "exploration_std_steps": 20_000,
+    "replay_size_steps": 25_000,
 }
-_SMALL = {
+_TARGETS = {2: {"target_update_steps": 5_000}, 4: {"target_update_steps": 2_500}}
+# Fields of single methods, in the sections that a method has.
+_SECTIONS = {
+    "discriminator": {
+        "batch_size": 64,
+        "hidden_dim": 256,
+        "learning_rate": 3e-4,
+        "width": 8,
+    },
+    "sinkhorn": {"num_iterations": 50},
     "cloning": {"batch_size": 64, "num_pairs": 64},
     "inverse_model": {
         "hidden_dim": 256,
@@ -84,6 +110,51 @@ _SMALL = {
 # These have a separate encoder, and penalties need its second derivatives: with 64, an
 # update of DAC takes five times as long.
 _DISCRIMINATOR_BATCHES = {"dac": 16, "sil": 16, "gaifo": 16, "patchail": 8}
+
+
+def _falling(learning_rate_steps: int) -> dict[str, Any]:
+    return {"learning_rate_steps": learning_rate_steps, "learning_rate_end": 5e-5}
+
+
+_TASKS = {
+    "ball_in_cup_catch": {"action_repeat": 4},
+    "cartpole_swingup": {
+        "action_repeat": 4,
+        "camera": "lookatcart",
+        "total_frames": 300_000,
+        **_falling(75_000),
+    },
+    "finger_spin": {
+        "total_frames": 400_000,
+        "exploration_std_steps": 20_000,
+        **_falling(125_000),
+    },
+    "walker_walk": {"total_frames": 700_000, **_falling(250_000)},
+}
+_BY_COMPONENTS = {"num_components": 32}
+_SMALL_PENALTY = {"pre_tanh_penalty": 2e-5}
+# With cloning too.
+_REWARDERS = {
+    ("pdac", "cartpole_swingup"): {"discriminator": {"gradient_penalty": 1.0}},
+    ("pdac", "finger_spin"): {"discriminator": _BY_COMPONENTS},
+    ("pdac", "walker_stand"): {"discriminator": _BY_COMPONENTS},
+    ("pdac", "walker_walk"): {"discriminator": _BY_COMPONENTS},
+    ("pdac", "walker_run"): {"discriminator": _BY_COMPONENTS},
+    ("psil", "ball_in_cup_catch"): {"total_frames": 200_000, "reward_refresh_steps": 0},
+    ("psil", "cartpole_swingup"): {"learning_rate_steps": 150_000, **_SMALL_PENALTY},
+    ("psil", "finger_spin"): {"sinkhorn": _BY_COMPONENTS, **_SMALL_PENALTY},
+    ("psil", "walker_stand"): _SMALL_PENALTY,
+    ("psil", "walker_walk"): {"sinkhorn": _BY_COMPONENTS, **_SMALL_PENALTY},
+    ("psil", "walker_run"): _SMALL_PENALTY,
+}
+# Cloning is too slow for it.
+_PDAC_ON_THE_CUP = {
+    "action_repeat": 2,
+    "total_frames": 50_000,
+    "eval_every_frames": 10_000,
+    "updates_per_step": 4,
+    "exploration_std_steps": 10_000,
+}
 
 
 def get_config(argument: str = "pdac,cartpole_swingup"):
@@ -100,69 +171,22 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
         )
     config = jaxil_config.default_config(method, task)
     rewarder = method.removesuffix("_cloning")
-    is_psil = rewarder == "psil"
-    repeats = _ACTION_REPEATS_OF_PDAC if method == "pdac" else _ACTION_REPEATS
-    config.action_repeat = repeats.get(task, 2)
-    config.total_frames = 500_000
-    config.camera = _CAMERAS.get(task, "")
-    config.image_size = 48
-    config.render_quality = "fast"
-    config.encoder.channels = (32, 32, 32)
-    config.encoder.kernel_sizes = (4, 3, 3)
-    config.encoder.strides = (4, 1, 1)
-    config.encoder.contrast = 4.0
-    config.encoder.subtract_mean_image = True
-    config.shift_padding = 2
-    config.hidden_dim = 256
-    config.batch_size = 64
-    config.update_every_steps = 1
-    config.learning_rate = 3e-4
-    falling = _FALLING_RATES_OF_PSIL if is_psil else _FALLING_RATES
-    if task in falling:
-        config.total_frames, config.learning_rate_steps = falling[task]
-        config.learning_rate_end = 5e-5
+    config.update(_ALL)
+    for name, fields in _SECTIONS.items():
+        section = config.get(name, {})
+        section.update({k: value for k, value in fields.items() if k in section})
+    if method in _DISCRIMINATOR_BATCHES:
+        config.discriminator.batch_size = _DISCRIMINATOR_BATCHES[method]
+    config.update(_TASKS.get(task, {}))
+    config.update(_REWARDERS.get((rewarder, task), {}))
+    if (method, task) == ("pdac", "ball_in_cup_catch"):
+        config.update(_PDAC_ON_THE_CUP)
+    if config.action_repeat > 2:
+        config.update(_REPEATED)
+    for section in (config.get("sinkhorn", {}), config.get("coverage", {})):
+        if "target_update_steps" in section:
+            section.update(_TARGETS[config.action_repeat])
     declared = methods.get(method)
     if not declared.plays:  # as many updates as with the paper's settings
         config.total_frames = declared.total_updates * config.action_repeat
-    is_small = is_psil and task in _SMALL_PENALTY_OF_PSIL
-    config.pre_tanh_penalty = 2e-5 if is_small else 2e-3
-    config.policy_tau = 1e-3
-    config.replay_size_steps = 50_000
-    config.replay_on_device = True  # also on CPUs, where XLA stacks faster than NumPy
-    config.exploration_std_steps = 20_000 if task == "finger_spin" else 50_000
-    discriminator = config.get("discriminator", {})
-    small = {
-        "batch_size": _DISCRIMINATOR_BATCHES.get(method, 64),
-        "gradient_penalty": _GRADIENT_PENALTIES.get((rewarder, task), 10.0),
-        "hidden_dim": 256,
-        "learning_rate": 3e-4,
-        "width": 8,
-    }
-    discriminator.update({n: v for n, v in small.items() if n in discriminator})
-    sinkhorn = config.get("sinkhorn", {})
-    if task in _JUDGED_BY_COMPONENTS.get(rewarder, ()):
-        (sinkhorn or discriminator).num_components = 32
-    if "num_iterations" in sinkhorn:
-        sinkhorn.num_iterations = 50
-    for section in (sinkhorn, config.get("coverage", {})):
-        if "target_update_steps" in section:
-            section.target_update_steps = 5_000 if config.action_repeat == 2 else 2_500
-    config.reward_refresh_steps = 2_500
-    config.eval_every_frames = 20_000
-    if task == "ball_in_cup_catch" and is_psil:
-        config.total_frames = 200_000
-        config.reward_refresh_steps = 0
-    elif task == "ball_in_cup_catch" and method == "pdac":  # cloning is too slow for it
-        config.total_frames, config.eval_every_frames = 50_000, 10_000
-        config.updates_per_step = 4
-        config.exploration_std_steps = 10_000
-    config.checkpoint_every_frames = 10_000
-    for section, sizes in _SMALL.items():
-        if section in config:
-            settings = config[section]
-            settings.update({n: size for n, size in sizes.items() if n in settings})
-    if config.action_repeat > 2:  # fewer agent steps in as many frames
-        config.exploration_steps = 500
-        config.exploration_std_steps = 20_000
-        config.replay_size_steps = 25_000
     return config
