@@ -25,6 +25,7 @@ class ProgressLine:
         total_frames: int,
         *,
         first_frame: int = 0,
+        even_from: int = 0,
         label: str = "",
         unit: str = "frames",
         stream: TextIO | None = None,
@@ -35,6 +36,8 @@ class ProgressLine:
         Args:
           total_frames: environment frames at the end, >= 1.
           first_frame: where this process starts; not 0 after a resume.
+          even_from: frame from which the speed tells the time left; before it, as
+            long as nothing is learned, frames are faster.
           label: starts the line.
           unit: what is counted, if not environment frames.
           stream: None for stderr.
@@ -62,6 +65,8 @@ class ProgressLine:
         )
         self._newest: Mapping[str, float] = {}  # of the returns
         self._history: list[float] = []
+        self._even_from = even_from
+        self._is_even = first_frame >= even_from
         self._label = f"{label}: " if label else ""
         self._unit = unit
         self._clock = clock
@@ -93,6 +98,9 @@ class ProgressLine:
         if now < self._next_update:
             return
         self._next_update = now + _TTY_SECONDS
+        if not self._is_even and frame >= self._even_from:
+            self._is_even = True
+            self._progress.reset(self._task)  # the speed too
         self._progress.update(self._task, completed=frame)
         if self._live:
             if not self._progress.live.is_started:
@@ -134,7 +142,7 @@ class ProgressLine:
         if returns:
             shown = " ".join(f"{name} {value:.1f}" for name, value in returns.items())
             parts.append(f"return {shown} {_sparkline(self._history)}".rstrip())
-        if speed > 0 and not task.finished:
+        if speed > 0 and self._is_even and not task.finished:
             parts.append(f"{duration((task.remaining or 0.0) / speed)} left")
         return " | ".join(parts)
 

@@ -157,6 +157,8 @@ def make_parts(
             frame if resumed else None,
             owes_evaluation=counters.owes_evaluation,
         ),
-        progress=ProgressLine(config.total_frames, first_frame=frame),
+        progress=ProgressLine(
+            config.total_frames, first_frame=frame, even_from=config.seed_frames
+        ),
         stopwatch=stopwatch,
     )

@@ -99,6 +99,19 @@ def test_a_log_file_gets_a_line_every_30_seconds():
     assert len(stream.getvalue().splitlines()) == 7  # after 3, 33, ... 183 seconds
 
 
+def test_frames_before_anything_is_learned_tell_nothing_of_the_time_left():
+    stream = io.StringIO()
+    line, clock = make_line(stream, total_frames=10_000, even_from=4_000)
+    frame = 0
+    for second in range(110):
+        clock.seconds = second
+        frame += 100 if second < 40 else 10
+        line.update(frame, {})
+    shown = stream.getvalue().splitlines()
+    assert ["left" in text for text in shown] == [False, False, True, True]
+    assert "10 frames/s" in shown[2]  # of the last seconds, not of the last minute
+
+
 def test_speed_follows_a_change():
     stream = io.StringIO()
     line, clock = make_line(stream, total_frames=10**6)
