@@ -73,9 +73,10 @@ def parse(
                 faults.append(Fault(f"--{name}", f"is wrong: {reason}"))
     values.mark_as_parsed()
     faults += check(values)
-    for reference in values[_TRUST].value or () if _TRUST in values else ():
-        if ":" not in reference:
-            what = "is not package.module:name"
+    named = ",".join(values[_TRUST].value or ()) if _TRUST in values else ""
+    for reference in filter(None, named.split(",")):
+        if not outside.is_found(reference):
+            what = "is not the package.module:name of a module that Python finds"
             faults.append(Fault("--trust", what, value=reference))
         outside.trust(reference)
     if _CONFIG in values:
@@ -144,8 +145,8 @@ def define_trust(values: flags.FlagValues) -> None:
     flags.DEFINE_multi_string(
         _TRUST,
         [],
-        "package.module:name of a method or task from outside that runs may import; "
-        "may be repeated",
+        "package.module:name of methods or tasks from outside that runs may import, "
+        "comma-separated",
         flag_values=values,
     )
 
@@ -261,7 +262,7 @@ def _config_of_file(value: str) -> Config:
         config = module.get_config(*([argument] if colon else []))
     except UsageError:
         raise
-    except Exception as error:  # whatever the user's file raises
+    except (Exception, SystemExit) as error:  # whatever the user's file raises
         raise UsageError(
             Fault("--config", f"cannot be loaded: {raised(error)}", value=value)
         ) from error

@@ -1,6 +1,7 @@
 """What a method declares of itself, and whether that can be used."""
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -38,7 +39,8 @@ class Variation(NamedTuple):
     Attributes:
       field: dotted, such as "sinkhorn.cost".
       plain: the value of the method itself.
-      words: what figures call another value; "{}" stands for it.
+      words: what figures call another value; "{}" stands for it, and is needed where
+        there are several.
     """
 
     field: str
@@ -69,7 +71,7 @@ class Method(NamedTuple):
       total_updates: length of a run of a method that does not play.
       needs_pixels: whether it cannot learn from state vectors.
       metrics: columns of train.csv beside those of the learner, such as "own/error".
-      variations: fields that make ablations.
+      variations: fields of it that make ablations.
     """
 
     name: str
@@ -90,21 +92,23 @@ class Method(NamedTuple):
 
 
 def problems(method: Method) -> Iterator[str]:
-    """Yields each rule that sections, fields or metrics break."""
+    """Yields each rule that the declaration breaks."""
+    yield from _plain_problems(method)
     if not isinstance(method.sections, Mapping):
         yield f"has sections={method.sections!r}; give a dict of dicts of Field"
         return
     yield from _section_problems(method.sections)
     own = {
-        f"{section}.{name}"
+        f"{section}.{name}": field
         for section, fields in method.sections.items()
         if isinstance(fields, Mapping)
-        for name in fields
+        for name, field in fields.items()
     }
     sees = method.sees_actions
     if isinstance(sees, str) and sees not in own:
         yield f"has sees_actions={sees!r}, which is none of its fields"
     yield from _metric_problems(method.metrics)
+    yield from _variation_problems(method.variations, own)
 
 
 def field_problems(name: str, field: Field, value: Any) -> Iterator[Fault]:
@@ -119,6 +123,42 @@ def field_problems(name: str, field: Field, value: Any) -> Iterator[Fault]:
         if not inside or (field.positive and value == low):
             interval = f"{'(' if field.positive else '['}{low}, {high}]"
             yield Fault(name, f"must lie in {interval}", field.about, value)
+
+
+def _plain_problems(method: Method) -> Iterator[str]:
+    for name in ("name", "label", "about"):
+        value = getattr(method, name)
+        if not isinstance(value, str) or (not value and name != "about"):
+            yield f"has {name}={value!r}; give a text"
+    if not isinstance(method.rank, int | float) or method.rank != method.rank:
+        yield f"has rank={method.rank!r}; give a number"
+    colour = method.colour
+    if not isinstance(colour, str) or not re.fullmatch(r"#[0-9a-fA-F]{6}", colour):
+        yield f"has colour={colour!r}; write #rrggbb"
+
+
+def _variation_problems(variations: Any, own: Mapping[str, Any]) -> Iterator[str]:
+    if not isinstance(variations, tuple | list) or not all(
+        isinstance(each, Variation) for each in variations
+    ):
+        yield f"has variations={variations!r}; give a tuple of Variation"
+        return
+    for field, plain, words in variations:
+        declared = own.get(field)
+        if not isinstance(declared, Field):
+            yield f"has a variation of {field!r}, which is none of its fields"
+            continue
+        try:
+            shown = words.format("\0")
+        except (AttributeError, LookupError, ValueError):
+            yield f"has a variation of {field} called {words!r}; write {{}} for a value"
+            continue
+        is_one = type(plain) is bool or len(declared.choices) == 2
+        if not is_one and "\0" not in shown:
+            yield (
+                f"has a variation of {field} called {words!r}, which would name "
+                "different values alike; write {} for the value"
+            )
 
 
 def _section_problems(sections: Any) -> Iterator[str]:
@@ -143,6 +183,12 @@ def _section_problems(sections: Any) -> Iterator[str]:
                     f"has {section}.{name} with the default {field.default!r}; give "
                     "True or False, a number, text or a tuple"
                 )
+                continue
+            if not isinstance(field.choices, tuple | list) or not all(
+                isinstance(choice, str) for choice in field.choices
+            ):
+                words = f"choices={field.choices!r}; give a tuple of names"
+                yield f"has {section}.{name} with {words}"
                 continue
             if (field.low, field.high) != (None, None) and (
                 type(field.default) not in (int, float)

@@ -32,7 +32,10 @@ act = jax.jit(export.deserialize(bytearray(_FILE.read_bytes())).call)
 '''
 _PLATFORMS = ("cpu", "cuda")
 # Beside shapes, what a user has to know to show the policy what it was trained on.
-_SETTINGS = ("task", "observation", "action_repeat", "frame_stack", "render_quality")
+_SETTINGS = (
+    *("task", "observation", "action_repeat", "frame_stack"),
+    *("camera", "render_quality", "distraction"),
+)
 
 
 def main(argv: list[str]) -> None:

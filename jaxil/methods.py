@@ -158,7 +158,7 @@ def load(name: str, function: str) -> Any:
     path = _references().get(name, name).partition(":")[0]
     try:
         module = importlib.import_module(path)
-    except Exception as error:  # whatever the user's file raises
+    except (Exception, SystemExit) as error:  # whatever the user's file raises
         rule = f"cannot be loaded: {raised(error)}"
         raise UsageError(Fault("method", rule, value=name)) from error
     if not hasattr(module, function):

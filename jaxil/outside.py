@@ -6,6 +6,8 @@ config, or with `--trust`.
 """
 
 import importlib
+import importlib.util
+from collections.abc import Mapping
 from typing import Any
 
 from jaxil.errors import Fault, UsageError, printable, raised
@@ -26,7 +28,7 @@ def load(reference: str, subject: str) -> Any:
     module, _, name = reference.partition(":")
     try:
         return getattr(importlib.import_module(module), name)
-    except Exception as error:  # whatever the user's file raises
+    except (Exception, SystemExit) as error:  # whatever the user's file raises
         raise UsageError(
             Fault(
                 subject,
@@ -46,29 +48,40 @@ def trust(reference: str) -> None:
     _trusted.add(reference)
 
 
+def is_found(reference: str) -> bool:
+    """Returns whether a reference names a module that Python finds, and a name."""
+    module, colon, name = reference.removeprefix("gymnasium:").partition(":")
+    try:
+        return bool(colon and name) and importlib.util.find_spec(module) is not None
+    except (Exception, SystemExit):  # it imports the packages around the module
+        return False
+
+
 def is_trusted(reference: str) -> bool:
     """Returns whether a file may name this code."""
     return reference in _trusted
 
 
-def require_trusted(reference: str, subject: str, where: object) -> None:
+def require_trusted(references: Mapping[str, str], where: object) -> None:
     """Refuses code that a file names and the user does not.
 
     Args:
-      reference: "package.module:name", as read from the file.
-      subject: the field that holds it.
+      references: "package.module:name" as read from the file, by the field's name.
       where: the file.
 
     Raises:
-      UsageError: the user has not named it in this process.
+      UsageError: the user has not named all of them in this process.
     """
-    if not is_trusted(reference):
-        raise UsageError(
-            Fault(
-                subject,
-                f"is code from outside that {where} names and you do not",
-                f"if you trust it, add --trust={printable(reference)} (in Python: "
-                "jaxil.trust)",
-                printable(reference),
-            )
+    faults = [
+        Fault(
+            subject,
+            f"is code from outside that {where} names and you do not",
+            f"if you trust it, add --trust={printable(reference)} (in Python: "
+            "jaxil.trust)",
+            printable(reference),
         )
+        for subject, reference in references.items()
+        if not is_trusted(reference)
+    ]
+    if faults:
+        raise UsageError(faults)

@@ -250,6 +250,14 @@ def _was_sprung(package) -> bool:
     return (package / "trap" / "sprung").exists()
 
 
+@pytest.mark.parametrize("named", ["nothing.at_all:METHOD", "jaxil.rewarders.pdac"])
+def test_what_is_trusted_exists(named):
+    ended = call("report", "runs", f"--trust=jaxil.rewarders.pdac:METHOD,{named}")
+    assert ended.returncode == 2
+    assert f"--trust='{named}' is not the package.module:name" in ended.stderr
+    assert "pdac:METHOD' is not" not in ended.stderr
+
+
 def test_reading_a_folder_imports_no_module_that_it_names(package, trap):
     printed = run_python(
         "import pathlib\n"
@@ -263,7 +271,7 @@ def test_reading_a_folder_imports_no_module_that_it_names(package, trap):
         "except UsageError as error: print(error)\n"
     )
     remarks, label, refusal = printed.splitlines()
-    assert "'trap.inner:METHOD' is not installed here" in remarks
+    assert "'trap.inner:METHOD' is code that only its folder names" in remarks
     assert label == "trap.inner:METHOD"
     assert "method='trap.inner:METHOD' is code from outside" in refusal
     assert "--trust=trap.inner:METHOD" in refusal

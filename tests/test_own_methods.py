@@ -102,7 +102,7 @@ def test_all_faults_of_a_declaration_are_one_message(write):
         "metric 'critic/own'",
         "metric 'flat/mean' twice",
     ]
-    assert len(faults) == len(words)
+    assert len(faults) == len(words), faults
     for fault, word in zip(faults, words, strict=True):
         assert word in fault
     text = write("texts", "uses_demonstrations", 'metrics=("x/y"),uses_demonstrations')
@@ -114,6 +114,41 @@ def test_all_faults_of_a_declaration_are_one_message(write):
     taken = write("takes", old, 'sections={"encoder": {}, "own": {}, "seed": {}},')
     with pytest.raises(UsageError, match=r"every config has \(encoder, seed\)"):
         jaxil_config.default_config(taken, "walker_walk")
+
+
+def test_what_a_report_reads_of_a_declaration_is_checked_at_the_start(write):
+    old = """sections={"flat": {"weight": methods.Field(1.0, "each reward", 1.0)}},"""
+    new = """sections={"flat": {
+        "weight": methods.Field(1.0, "each reward", 1.0),
+        "form": methods.Field("a", "", choices=("a", "b")),
+        "other": methods.Field("a", "", choices="ab"),
+    }},
+    rank="first",
+    colour="pinkish",
+    variations=(
+        methods.Variation("flat.form", "a", "b"),
+        methods.Variation("flat.weight", 1.0, "weight {}"),
+        methods.Variation("flat.weight", 1.0, "heavy"),
+        methods.Variation("flat.weight", 1.0, "{weight}"),
+        methods.Variation("flat.none", 1.0, "{}"),
+    ),"""
+    with pytest.raises(UsageError) as refused:
+        jaxil_config.default_config(write("shown", old, new), "walker_walk")
+    words = [
+        "rank='first'; give a number",
+        "colour='pinkish'; write #rrggbb",
+        "flat.other with choices='ab'; give a tuple",
+        "flat.weight called 'heavy', which would name different values alike",
+        "flat.weight called '{weight}'; write {} for a value",
+        "a variation of 'flat.none', which is none of its fields",
+    ]
+    faults = [str(fault) for fault in refused.value.faults]
+    assert len(faults) == len(words), faults
+    for fault, word in zip(faults, words, strict=True):
+        assert word in fault
+    bare = write("bare", old, """variations=methods.Variation("a.b", 1, "{}"),""")
+    with pytest.raises(UsageError, match="give a tuple of Variation"):
+        jaxil_config.default_config(bare, "walker_walk")
 
 
 def test_the_small_preset_sets_only_declared_fields(write):

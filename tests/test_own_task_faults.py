@@ -92,6 +92,8 @@ def test_numbers_that_a_task_offers_are_numbers(name, value, monkeypatch):
     monkeypatch.setitem(globals(), "offering", lambda: task)
     with pytest.raises(ValueError, match=f"has {name}=.*number above 0"):
         _ = tasks.make_environment(f"{__name__}:offering", seed=0).step_seconds
+    (fault,) = tasks.problems(f"{__name__}:offering", **settings())
+    assert f"has {name}=" in str(fault)
 
 
 def test_whole_numbers_are_rounded_to(monkeypatch):
@@ -119,13 +121,15 @@ def test_images_have_one_size():
         environment.step(np.zeros(1))
 
 
-def test_an_error_of_the_task_says_where_it_is(monkeypatch):
+@pytest.mark.parametrize("error", [ValueError("no light"), SystemExit("no light")])
+def test_an_error_of_the_task_says_where_it_is(error, monkeypatch):
     def failing():
-        raise ValueError("no light")
+        raise error
 
     monkeypatch.setitem(globals(), "failing", failing)
     (fault,) = tasks.problems(f"{__name__}:failing", **settings())
-    assert "ValueError: no light (test_own_task_faults.py, line " in str(fault)
+    said = f"{type(error).__name__}: no light (test_own_task_faults.py, line "
+    assert said in str(fault)
 
 
 def test_an_error_in_mid_episode_ends_a_run_in_one_message(monkeypatch, tmp_path):
@@ -232,6 +236,16 @@ def test_every_environment_is_closed(num_environments, tmp_path, monkeypatch):
     assert len({which.split()[0] for which in made}) == 1 + (
         num_environments if num_environments > 1 else 0
     )
+
+
+def test_a_task_that_observes_images_alone_is_timed(monkeypatch):
+    monkeypatch.setitem(globals(), "drawn", Task)
+    flags = (f"--config=drqv2:{__name__}:drawn", *small("drqv2"))
+    words = ("--config.action_repeat=100", "--repeats=1", "--steps=2", "--nostart")
+    ended = call("benchmark", *flags, *words)
+    assert ended.returncode == 0, ended.stderr
+    assert "render_ms" in ended.stdout
+    assert "physics_ms" not in ended.stdout
 
 
 def begun(task):

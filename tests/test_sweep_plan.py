@@ -120,7 +120,18 @@ METHOD = methods.Method(
     sections={"own": {"strength": methods.Field(1.0, "of it", 0.0, 9.0)}},
     uses_demonstrations=False,
 )
+
+
+def make_rewarder(agent, *, strength):
+    raise NotImplementedError
 """
+
+
+def test_a_method_from_outside_without_its_function_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "hollow.py").write_text(_OUTSIDER.replace("make_rewarder", "make"))
+    monkeypatch.syspath_prepend(tmp_path)
+    told = faults_of(tmp_path / "runs", methods=["hollow:METHOD"])
+    assert any("'hollow' has no `make_rewarder`" in fault for fault in told)
 
 
 def test_every_fault_of_every_run_is_told_once(tmp_path):
@@ -175,6 +186,21 @@ def test_clusters_that_are_not_there(monkeypatch):
     assert not list(clusters.problems(Cluster("slurm"), starts=False))
     (fault,) = clusters.problems(Cluster("pbs"), starts=True)
     assert "local, slurm, debug" in str(fault)
+
+
+@pytest.mark.parametrize(
+    ("given", "flag"),
+    [
+        ({"hours": 2.0}, "--hours=2.0"),
+        ({"partition": "gpu"}, "--partition='gpu'"),
+        ({"num_gpus": 0}, "--gpus=0"),
+        ({"num_cpus": 8}, "--cpus=8"),
+    ],
+)
+def test_flags_of_slurm_alone_are_not_ignored(given, flag):
+    assert not list(clusters.problems(Cluster("slurm", **given), starts=False))
+    (fault,) = clusters.problems(Cluster("local", **given), starts=False)
+    assert f"{flag} is for --cluster=slurm" in str(fault)
 
 
 def test_slurm_commands_without_a_cluster_are_no_slurm(tmp_path, monkeypatch):

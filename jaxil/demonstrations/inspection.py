@@ -269,7 +269,7 @@ def _read_states(path: pathlib.Path) -> states.StateDemonstrations:
     """Reads states to render; their task must be trusted if it names code."""
     stored = states.read_states(path)
     if tasks.names_code(stored.metadata["task"]):
-        outside.require_trusted(stored.metadata["task"], "task", path)
+        outside.require_trusted({"task": stored.metadata["task"]}, path)
     return stored
 
 

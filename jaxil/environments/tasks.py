@@ -58,12 +58,13 @@ def problems(task: str, **settings: Any) -> list[Fault]:
         if not is_of_suite(task):
             environment.reset(episode=0)
             environment.step(np.zeros(environment.action_spec().shape))
+            _ = environment.step_seconds
             if settings["observation"] == "pixels":
                 environment.frame()
         environment.close()
     except UsageError as error:
         return [f if isinstance(f, Fault) else Fault("task", f) for f in error.faults]
-    except Exception as error:  # whatever the user's task raises
+    except (Exception, SystemExit) as error:  # whatever the user's task raises
         return [Fault("task", f"cannot be used: {raised(error)}", value=task)]
     return []
 

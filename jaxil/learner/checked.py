@@ -1,5 +1,6 @@
 """What a method returns, checked where it is traced: mistakes of one's own methods."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -8,15 +9,16 @@ from jax import Array
 
 from jaxil.errors import MethodError
 from jaxil.learner.rewarder import Rewarder
-from jaxil.maths.types import AnyEpisode
+from jaxil.maths.types import AnyEpisode, ExpertBatch, Metrics
 
 
 def checked_rewarder(name: str, rewarder: Rewarder) -> Rewarder:
     """Returns the rewarder, which raises MethodError where it breaks its interface.
 
-    Checked are shapes and types, once for each compilation: rewards are [T], and
-    `observe` and `update` return a state like the one that they got. A state that
-    changed would train, and its checkpoint could not be loaded again.
+    Checked are shapes and types, once for each compilation: rewards are [T],
+    metrics are scalars, and `observe` and `update` return a state like the one that
+    they got. A state that changed would train, and its checkpoint could not be loaded
+    again.
 
     Args:
       name: of the method, for the message.
@@ -38,9 +40,29 @@ def checked_rewarder(name: str, rewarder: Rewarder) -> Rewarder:
     def observe(state: Any, *arguments: Any) -> Any:
         return _like(name, "observe", state, rewarder.observe(state, *arguments))
 
-    def update(state: Any, *arguments: Any) -> Any:
-        found, metrics = rewarder.update(state, *arguments)
-        return _like(name, "update", state, found), metrics
+    def update(
+        state: Any, learner: Any, view: Any, expert: ExpertBatch | None, key: Array
+    ) -> tuple[Any, Metrics]:
+        try:
+            found = rewarder.update(state, learner, view, expert, key)
+        except AttributeError as error:
+            if expert is not None or "'NoneType'" not in str(error):
+                raise
+            words = "`update` gets no expert samples unless `expert_batch_size` is set"
+            raise MethodError(f"{name}: {words} ({error})") from error
+        is_pair = isinstance(found, tuple) and len(found) == 2
+        if not (is_pair and isinstance(found[1], Mapping)):
+            what = type(found).__name__
+            raise MethodError(
+                f"{name}: `update` returned {what}; expected (state, metrics by name)"
+            )
+        for metric, value in found[1].items():
+            if shape := jnp.shape(value):
+                raise MethodError(
+                    f"{name}: `update` returned the metric {metric!r} of shape {shape};"
+                    " expected a scalar"
+                )
+        return _like(name, "update", state, found[0]), found[1]
 
     return rewarder._replace(rewards=rewards, observe=observe, update=update)
 

@@ -51,10 +51,11 @@ class Group(NamedTuple):
     Attributes:
       task: such as "walker_walk".
       variant: the method with what an ablation changed.
-      settings: those that differ from the paper's and from other runs of the same
-        variant, on any task, such as "action_repeat 4".
+      settings: those that differ from the paper's and, on some task, among the runs of
+        the same variant, such as "action_repeat 4".
       label: the variant with its settings, or with a letter in their place where that
-        takes more than three words; the same on every task.
+        takes more than three words; the same on every task. The name of its method is
+        added where another has the same label.
       look: the same for all groups of this label.
       runs: by seed and folder, at least one.
     """
@@ -117,13 +118,17 @@ def make_groups(runs: Iterable[Run]) -> list[Group]:
 
 
 def differing_fields(runs: Sequence[Run]) -> list[str]:
-    """Returns the settings that matter to all of the runs and differ among them."""
+    """Returns the settings that matter to all of the runs and differ within a task.
+
+    Presets set some of them for each task, which a task's name already says.
+    """
     fields = {field for run in runs for field in run.config}
+    tasks = {run.task for run in runs}
     return sorted(
         field
         for field in fields
         if all(_has(run, field) and _matters(run, field) for run in runs)
-        and len({repr(run.config.get(field)) for run in runs}) > 1
+        and len({(run.task, repr(run.config.get(field))) for run in runs}) > len(tasks)
     )
 
 
@@ -202,11 +207,14 @@ def _matters(run: Run, field: str) -> bool:
 def _labels(keys: Iterable[tuple[str, str, tuple[str, ...]]]) -> dict[tuple, str]:
     """Names each (method, label, settings): a letter stands for several settings."""
     found: dict[tuple, str] = {}
+    owners: dict[str, str] = {}  # methods by label
     letters: Counter[tuple[str, str]] = Counter()
     for key in keys:
         method, label, settings = key
         if key in found:
             continue
+        if owners.setdefault(label, method) != method:
+            label = f"{label} [{method}]"
         text = f"{label} ({', '.join(settings)})" if settings else label
         plain = figures.declaration(method).label
         if settings and len(text.removeprefix(plain).split()) > _MAX_WORDS:

@@ -143,7 +143,11 @@ def read(folder: pathlib.Path) -> Run:
     config = {name: _setting(nested, name, value) for name, value in defaults.items()}
     remarks: list[str] = []
     if not figures.is_installed(nested["method"]):
-        remarks.append(f"its method {nested['method']!r} is not installed here")
+        name = nested["method"]
+        why = "not installed here"
+        if ":" in name and not methods.is_trusted(name):
+            why = f"code that only its folder names: --trust={name} imports it"
+        remarks.append(f"its method {name!r} is {why}")
         known = {name.split(".")[0] for name in config}
         own = {key: value for key, value in nested.items() if key not in known}
         config |= flat(own)

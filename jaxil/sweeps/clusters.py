@@ -38,6 +38,14 @@ _PATIENCE_SECONDS = 300.0  # file locks of a crashed node last a while
 _VERDICT_SECONDS = 600.0
 
 
+_SLURM_FLAGS = {
+    "hours": "--hours",
+    "partition": "--partition",
+    "num_gpus": "--gpus",
+    "num_cpus": "--cpus",
+}
+
+
 class Cluster(NamedTuple):
     """Where to run, unchecked."""
 
@@ -75,6 +83,11 @@ def problems(cluster: Cluster, *, starts: bool) -> Iterator[Fault]:
     if cluster.num_workers is not None and not 1 <= cluster.num_workers <= most:
         rule = f"must lie in [1, {most}]: a run needs a core, and there are {most}"
         yield Fault("--workers", rule, value=cluster.num_workers)
+    if cluster.name in CLUSTERS and cluster.name != "slurm":
+        for field, flag in _SLURM_FLAGS.items():
+            value = getattr(cluster, field)
+            if value != Cluster._field_defaults[field]:
+                yield Fault(flag, "is for --cluster=slurm", "add that", value)
     if not 0.0 < cluster.hours <= 10_000.0:
         rule = "must lie in (0, 10000]: the time limit of a Slurm job"
         yield Fault("--hours", rule, value=cluster.hours)

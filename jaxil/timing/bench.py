@@ -84,8 +84,11 @@ class Bench:
             run.player.begin(lambda _: True)
             run.act(run.player.observations)
 
-    def parts(self) -> dict[str, tuple[Callable[[], Any], int]]:
-        """Returns the parts of a run by name, and how often one call executes each."""
+    def parts(self) -> dict[str, tuple[Callable[[], Any] | None, int]]:
+        """Returns the parts of a run by name, and how often one call executes each.
+
+        One that the run does not have is None.
+        """
         run = self.run
         return {
             "physics_ms": (self._physics_step(), 1),
@@ -159,12 +162,18 @@ class Bench:
         """Ends worker processes and closes files."""
         self.run.close()
 
-    def _physics_step(self) -> Callable[[], Any]:
-        """Returns a function that steps an environment without rendering."""
+    def _physics_step(self) -> Callable[[], Any] | None:
+        """Returns a function that steps an environment without rendering.
+
+        None if the task observes images alone.
+        """
         config = self.config.copy_and_resolve_references()
         with config.unlocked():
             config.observation = "state"
-        environment = assembly.training_environment(config)
+        try:
+            environment = assembly.training_environment(config)
+        except ValueError:
+            return None
         environment.reset(episode=0)
         action = np.zeros(environment.action_spec().shape)
         return lambda: environment.step(action)

@@ -53,6 +53,9 @@ def measure(
     ):
         results: dict[str, Any] = {"ranges": {}}
         for name, (function, num_calls) in bench.parts().items():
+            if function is None:
+                results[name] = None
+                continue
             times = 10 * repeats if name in _SHORT_PARTS else repeats
             timing = timed(function, times)
             median, *ends = (1e3 * each / num_calls for each in timing)

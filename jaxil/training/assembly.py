@@ -64,8 +64,12 @@ def problems(config: Config) -> list[Fault]:
     if not bad & _READING_FIELDS and jaxil_config.uses_demonstrations(config):
         fault = demonstration_fault(config)
         if fault is not None:
-            source = config.demonstrations.source
-            faults.append(Fault(f"demonstrations.source={source!r}:", fault))
+            source, way_out = config.demonstrations.source, ""
+            if not methods.get(config.method).uses_demonstrations:
+                way_out = (
+                    "only the mean image needs them: encoder.subtract_mean_image=False"
+                )
+            faults.append(Fault(f"demonstrations.source={source!r}:", fault, way_out))
     return faults
 
 

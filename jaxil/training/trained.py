@@ -86,7 +86,7 @@ class Policy:
           UsageError: the task is code that only the run's folder names.
         """
         if tasks.names_code(self.config.task):
-            outside.require_trusted(self.config.task, "task", "the run's folder")
+            outside.require_trusted({"task": self.config.task}, "the run's folder")
         return assembly.environment_with_seed(self.config, seed)
 
     def description(self) -> str:

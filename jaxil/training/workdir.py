@@ -190,10 +190,10 @@ def read_config(workdir: pathlib.Path, *, imports_task: bool = True) -> Config:
     try:
         stored = _read_json(path)["config"]
         method, task = str(stored["method"]), str(stored["task"])
-        if ":" in method:
-            outside.require_trusted(method, "method", path)
+        code = {"method": method} if ":" in method else {}
         if imports_task and tasks.names_code(task):
-            outside.require_trusted(task, "task", path)
+            code["task"] = task
+        outside.require_trusted(code, path)
         config = jaxil_config.defaults(method, task)
         known = jaxil_config.fields(method)
         there = flat(stored)

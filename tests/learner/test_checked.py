@@ -76,3 +76,24 @@ def test_what_keeps_the_interface_passes_unchanged():
         _STATE,
         {"mine/loss": 1.0},
     )
+
+
+@pytest.mark.parametrize(
+    ("update", "named"),
+    [
+        (lambda state, *_: state, r"`update` returned dict; expected \(state, metrics"),
+        (lambda state, *_: (state, jnp.ones(2)), "`update` returned tuple; expected"),
+        (
+            lambda state, *_: (state, {"own/error": jnp.ones(2)}),
+            r"the metric 'own/error' of shape \(2,\); expected a scalar",
+        ),
+        (
+            lambda state, learner, view, expert, key: (state, {"a/b": expert.action}),
+            "no expert samples unless `expert_batch_size` is set",
+        ),
+    ],
+)
+def test_an_update_returns_a_state_and_scalars(update, named):
+    rewarder = _rewarder(update=update)
+    with pytest.raises(MethodError, match=f"mine: .*{named}"):
+        jax.eval_shape(rewarder.update, _STATE, _ANY, _ANY, None, _ANY)

@@ -35,8 +35,10 @@ def test_every_declared_variation_has_a_name():
 def test_methods_from_outside_and_missing_ones_have_names(tmp_path, monkeypatch):
     (tmp_path / "outside.py").write_text(
         "from jaxil import methods\n"
-        "METHOD = methods.Method(name='mine', label='Mine', about='', variations=(\n"
-        "    methods.Variation('own.size', 1, 'size {}'),))\n"
+        "METHOD = methods.Method(\n"
+        "    name='mine', label='Mine', about='',\n"
+        "    sections={'own': {'size': methods.Field(1, '')}},\n"
+        "    variations=(methods.Variation('own.size', 1, 'size {}'),))\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     outside.trust("outside:METHOD")

@@ -6,6 +6,7 @@ import os
 import numpy as np
 import pytest
 
+from jaxil import methods
 from jaxil.reporting import episodes, groups, measures, remarks, runs, tables
 from tests.reporting.run_folders import EVAL_HEADER, film, many_runs, write_run
 
@@ -225,7 +226,9 @@ def test_a_label_means_the_same_on_every_task(tmp_path):
     read = []
     for task, changes in (
         ("walker_walk", {}),
+        ("walker_walk", {"batch_size": 64}),
         ("hopper_hop", {"action_repeat": 4}),
+        ("hopper_hop", {"action_repeat": 4, "batch_size": 64}),
         ("hopper_hop", {"action_repeat": 4, "shift_padding": 0}),
         ("walker_walk", {"shift_padding": 0}),
     ):
@@ -233,11 +236,31 @@ def test_a_label_means_the_same_on_every_task(tmp_path):
         write_run(folder, "pdac", task, 0, {1000: 1}, changes=changes)
         read.append(runs.read(folder))
     assert {(group.task, group.label) for group in groups.make_groups(read)} == {
-        ("walker_walk", "P-DAC"),
-        ("hopper_hop", "P-DAC (action_repeat 4)"),
-        ("hopper_hop", "P-DAC, no augmentation (A)"),  # four words beyond "P-DAC"
-        ("walker_walk", "P-DAC, no augmentation"),
+        (task, label)
+        for task in ("walker_walk", "hopper_hop")
+        for label in ("P-DAC", "P-DAC (batch_size 64)", "P-DAC, no augmentation")
     }
+
+
+def test_what_a_preset_sets_for_a_task_splits_no_method(tmp_path):
+    for task, size in (("cartpole_swingup", 400_000), ("walker_walk", 700_000)):
+        changes = {"replay_size_steps": size}
+        write_run(tmp_path / task, "pdac", task, 0, {1000: 1}, changes=changes)
+    shown = [runs.read(path) for path in runs.find([tmp_path])]
+    made = groups.make_groups(shown)
+    assert [group.label for group in made] == ["P-DAC", "P-DAC"]
+
+
+def test_methods_with_one_label_are_told_apart(tmp_path, monkeypatch):
+    declared = {name: methods.get(name) for name in ("pdac", "psil")}
+    same = {name: each._replace(label="Same") for name, each in declared.items()}
+    monkeypatch.setattr(methods, "get", same.__getitem__)
+    for name in same:
+        write_run(tmp_path / name, name, "walker_walk", 0, {1000: 1})
+    shown = [runs.read(path) for path in runs.find([tmp_path])]
+    made = groups.make_groups(shown)
+    assert [group.label for group in made] == ["Same", "Same [psil]"]
+    assert made[0].look != made[1].look
 
 
 def test_a_return_is_a_share_of_its_own_experts(tmp_path):
@@ -259,7 +282,8 @@ def test_a_run_whose_method_is_not_installed_is_shown(tmp_path):
         stored["config"] |= {"method": "gone.away:METHOD", "own": {"size": size}}
         (folder / "config.json").write_text(json.dumps(stored))
         shown.append(runs.read(folder))
-    assert "its method 'gone.away:METHOD' is not installed here" in shown[0].remarks
+    said = "'gone.away:METHOD' is code that only its folder names: --trust=gone.away:"
+    assert said in " ".join(shown[0].remarks)
     made = groups.make_groups(shown)
     assert [(group.label, len(group.runs)) for group in made] == [
         ("gone.away:METHOD (own.size 1)", 2),
