@@ -238,6 +238,28 @@ def test_every_environment_is_closed(num_environments, tmp_path, monkeypatch):
     )
 
 
+def test_an_error_in_closing_a_task_hides_no_other(monkeypatch, tmp_path, caplog):
+    class Stuck(Task):
+        step_limit = 6
+
+        def close(self):
+            raise OSError("the simulator is gone")
+
+    class Exploding(Stuck):
+        def step(self, action):
+            raise FloatingPointError("NaN in the simulation")
+
+    for name, task in (("stuck", Stuck), ("exploding", Exploding)):
+        monkeypatch.setitem(globals(), name, task)
+        names = (f"--policy={__name__}:still", f"--task={__name__}:{name}")
+        output = f"--output={tmp_path / name}.npz"
+        ended = call("collect", *names, "--num_episodes=1", output)
+        assert ended.returncode == (name == "exploding"), ended.stderr
+        assert "in close(): OSError: the simulator is gone (test_own" in caplog.text
+        caplog.clear()
+        assert ("NaN in the simulation" in ended.stderr) == (name == "exploding")
+
+
 def test_a_task_that_observes_images_alone_is_timed(monkeypatch):
     monkeypatch.setitem(globals(), "drawn", Task)
     flags = (f"--config=drqv2:{__name__}:drawn", *small("drqv2"))

@@ -1,5 +1,6 @@
 """A task as the agent sees it: agent steps, stacked images or states."""
 
+import logging
 import math
 import numbers
 from collections.abc import Mapping
@@ -10,10 +11,13 @@ import numpy as np
 from dm_env import specs
 from PIL import Image
 
+from jaxil.errors import raised
 from jaxil.replay.stacking import gather_stacks
 
 _UNBOUNDED = 1e9  # MuJoCo's value for an actuator without limits
 _USUAL_FRAMES = 1000  # of an episode in dm_control
+
+_logger = logging.getLogger(__name__)
 
 
 class PixelEnvironment(dm_env.Environment):
@@ -204,8 +208,11 @@ class PixelEnvironment(dm_env.Environment):
         return None if seconds is None else seconds * self._action_repeat
 
     def close(self) -> None:
-        """Frees the simulation."""
-        self._simulator.close()
+        """Frees the simulation; an error of the task's own `close` is only logged."""
+        try:
+            self._simulator.close()
+        except Exception as error:  # whatever the user's task raises
+            _logger.warning("the task raised an error in close(): %s", raised(error))
 
     def _own_number(self, name: str) -> Any:
         """Returns a number that the task may offer, None without it."""

@@ -186,8 +186,7 @@ class Player:
 
     def close(self) -> None:
         """Closes the environments."""
-        with told_as("the task", "close()"):
-            self._environments.close()
+        self._environments.close()
 
     def _order(self) -> list[int]:
         return sorted(self._open, key=lambda index: self._open[index].number)

@@ -6,7 +6,7 @@ import os
 import signal
 import socket
 import struct
-import sys
+import time
 from collections.abc import Callable, Iterator
 from multiprocessing import resource_tracker
 from typing import Any
@@ -124,8 +124,9 @@ class Pool:
         """Ends all processes."""
         for worker in self._workers.values():
             worker.dismiss()
+        end = time.monotonic() + _EXIT_SECONDS
         while self._workers:
-            self._workers.popitem()[1].close(_EXIT_SECONDS)
+            self._workers.popitem()[1].close(max(end - time.monotonic(), 0.0))
 
 
 class _Worker:
@@ -192,11 +193,8 @@ def _serve(make: Callable[[], Any], pipe: Any) -> None:
         signal.alarm(round(_EXIT_SECONDS))  # kills a driver that hangs
         environment.close()
     except Exception as error:
-        try:
+        with contextlib.suppress(ConnectionError):
             pipe.send(raised(error))
-        except ConnectionError:
-            words = f"the task raised an error in close(): {raised(error)}"
-            print(words, file=sys.stderr, flush=True)
     os._exit(0)  # without further cleanup, in which GL drivers may hang
 
 

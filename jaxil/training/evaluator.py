@@ -8,7 +8,6 @@ import numpy as np
 from jaxil.config import Config
 from jaxil.environments.evaluation import Evaluation, Stopped, evaluate
 from jaxil.environments.pixel_environment import PixelEnvironment
-from jaxil.errors import told_as
 from jaxil.learner.state import TrainState
 from jaxil.maths.types import Episode, ExpertEpisodes
 from jaxil.training import film
@@ -111,8 +110,7 @@ class Evaluator:
 
     def close(self) -> None:
         """Closes the environment."""
-        with told_as("the task", "close()"):
-            self.environment.close()
+        self.environment.close()
 
     def explain(self, state: TrainState, episode: Episode) -> dict[str, np.ndarray]:
         """Returns an episode's rewards and transport plan, for videos and reports.
