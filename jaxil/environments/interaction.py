@@ -82,7 +82,7 @@ class Moment(NamedTuple):
 
 
 class Environments(Protocol):
-    """One environment or several, which step until `receive` is called."""
+    """One environment or several, whose steps `receive` waits for."""
 
     size: int  # how many there are
 
