@@ -71,6 +71,7 @@ class Dummies:
             evaluator=_part(
                 environment=_part(action_spec=lambda: _part(shape=(1,))),
                 evaluate=self._evaluate,
+                close=lambda: None,
             ),
             checkpoints=_part(
                 save=lambda **_: self.tape.append("save"), newest=lambda: 4000

@@ -15,6 +15,9 @@ class Counting:
         """Takes the agent steps of an episode, or a function of its number."""
         self.episode_steps = episode_steps
 
+    def close(self):
+        pass
+
     def reset(self, episode):
         steps = self.episode_steps
         self.episode, self.time = episode, 0

@@ -22,6 +22,9 @@ class Drawing:
 
     episode_steps = STEPS
 
+    def close(self):
+        pass
+
     def reset(self, episode):
         self._rng = np.random.default_rng(episode)
         self._time, self._place = 0, np.full(2, SIDE / 2)

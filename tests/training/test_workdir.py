@@ -128,7 +128,7 @@ def test_a_policy_makes_no_task_of_code_that_its_run_alone_names(tmp_path, monke
     with pytest.raises(UsageError, match="--trust=harmful:make"):
         policy.make_environment()
     monkeypatch.setattr(outside, "_trusted", {config.task})
-    with pytest.raises(SystemExit, match="imported"):
+    with pytest.raises(UsageError, match="SystemExit: imported"):
         policy.make_environment()
 
 
