@@ -15,7 +15,7 @@ from jaxil.machine import screen
 from jaxil.machine.signals import StopOnSignals
 from jaxil.maths.types import Episode
 from jaxil.training import assembly
-from jaxil.training.parts import Parts, make_parts
+from jaxil.training.parts import Parts
 from jaxil.training.run_log import as_floats
 
 # NumPy's random streams. Numbers are keyed by (seed, stream, step), so a resumed run
@@ -333,7 +333,7 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
     demonstrations = assembly.load_demonstrations(config)
     method = methods.get(config.method)
     screen.say(f"{config.task}: {method.label}, {method.about}; seed {config.seed}")
-    run = Run(**make_parts(config, workdir, demonstrations, screen.say))
+    run = Run.make(config, workdir, demonstrations, screen.say)
     with contextlib.closing(run), StopOnSignals(run.ask_to_stop):
         try:
             run.loop()

@@ -1,6 +1,5 @@
 """What the loop does about stops, lost episodes and numbers that are not finite."""
 
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -141,11 +140,7 @@ def test_the_end_of_environments_names_the_way_on(monkeypatch, tmp_path):
         raise EnvironmentsFailed(f"environment {index} was killed by SIGKILL.")
 
     dummies.environments.receive = fail
-    parts = {
-        field.name: getattr(dummies.run, field.name)
-        for field in dataclasses.fields(train.Parts)
-    }
-    monkeypatch.setattr(train, "make_parts", lambda *_: parts)
+    monkeypatch.setattr(train.Run, "make", lambda *_: dummies.run)
     with pytest.raises(EnvironmentsFailed, match="SIGKILL") as caught:
         train.train(make_config(method="drqv2"), tmp_path)
     assert "that of frame 4000. Rerun the same command" in str(caught.value)

@@ -15,7 +15,6 @@ from jaxil.machine.progress import ProgressLine
 from jaxil.maths.types import Episode
 from jaxil.training import agent as agents
 from jaxil.training import assembly
-from jaxil.training.parts import make_parts
 
 _RENDERED_FRAMES = 20  # of the random episode; rendering 500 would take too long
 
@@ -61,7 +60,7 @@ class Bench:
             config.exploration_steps = 0
             config.seed_frames = config.total_frames = config.action_repeat
         self._demonstrations = assembly.load_demonstrations(config)
-        self.run = run = _Loop(**make_parts(config, folder, self._demonstrations, say))
+        self.run = run = _Loop.make(config, folder, self._demonstrations, say)
         self._environment = assembly.training_environment(config)
         run.progress = ProgressLine(config.total_frames, stream=io.StringIO())
         self._rng = np.random.default_rng(0)

@@ -44,7 +44,7 @@ class Evaluator:
         experts: ExpertEpisodes | None,
         distance: ExpertDistance | None,
     ) -> None:
-        """See `parts.make_parts`."""
+        """See `parts.Parts.make`."""
         self._config = config
         self._agent = agent
         self.environment = environment

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import pathlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import jax
 import numpy as np
@@ -90,75 +90,80 @@ class Parts:
     progress: ProgressLine
     stopwatch: Stopwatch
 
+    @classmethod
+    def make(
+        cls,
+        config: Config,
+        workdir: pathlib.Path,
+        demonstrations: Demonstrations | None,
+        say: Callable[[str], None],
+    ) -> Self:
+        """Returns a run's parts, as of its newest checkpoint if there is one.
 
-def make_parts(
-    config: Config,
-    workdir: pathlib.Path,
-    demonstrations: Demonstrations | None,
-    say: Callable[[str], None],
-) -> dict[str, Any]:
-    """Returns the arguments of `Parts`, as of the newest checkpoint if there is one.
-
-    Args:
-      config: checked.
-      workdir: the run's folder.
-      demonstrations: what the method imitates, or None.
-      say: prints a line.
-    """
-    environment = assembly.training_environment(config)
-    agent = agents.make_agent(config, environment, demonstrations)
-    replay = assembly.make_replay(config, environment)
-    checkpoints = Checkpoints(workdir, say=say)
-    counters, open_episodes = Counters(), {}
-    resumed = checkpoints.newest() is not None
-    if resumed:
-        abstract_state = jax.eval_shape(agent.init_state)
-        state, saved = checkpoints.restore(abstract_state, replay)
-        open_episodes = {
-            int(number): np.asarray(actions, np.float32)
-            for number, actions in saved.pop("open_episodes", {}).items()
-        }
-        counters = Counters(**saved)
-    else:
-        state = agent.init_state()
-    frame = counters.num_steps * config.action_repeat
-    if resumed:
-        say(f"resuming from the checkpoint of frame {frame}")
-    stopwatch = Stopwatch()
-    experts = agents.expert_episodes(agent.rewarder, demonstrations)
-    distance = None
-    if demonstrations is not None:
-        distance = ExpertDistance(config, workdir, demonstrations)
-    return dict(  # noqa: C408
-        config=config,
-        agent=agent,
-        state=state,
-        counters=counters,
-        episode_steps=environment.episode_steps,
-        player=assembly.make_player(
-            config,
-            environment,
-            first_episode=counters.num_episodes + len(open_episodes),
-            open_episodes=open_episodes,
-            timed=functools.partial(TimedPool, stopwatch=stopwatch),
-            say=say,
-        ),
-        replay=replay,
-        updates=Updates(config, agent, replay, demonstrations, experts),
-        experts=experts,
-        evaluator=Evaluator(
-            config, agent, assembly.evaluation_environment(config), experts, distance
-        ),
-        checkpoints=checkpoints,
-        log=Outputs(
-            workdir,
-            config,
-            demonstrations,
-            frame if resumed else None,
-            owes_evaluation=counters.owes_evaluation,
-        ),
-        progress=ProgressLine(
-            config.total_frames, first_frame=frame, even_from=config.seed_frames
-        ),
-        stopwatch=stopwatch,
-    )
+        Args:
+          config: checked.
+          workdir: the run's folder.
+          demonstrations: what the method imitates, or None.
+          say: prints a line.
+        """
+        environment = assembly.training_environment(config)
+        agent = agents.make_agent(config, environment, demonstrations)
+        replay = assembly.make_replay(config, environment)
+        checkpoints = Checkpoints(workdir, say=say)
+        counters, open_episodes = Counters(), {}
+        resumed = checkpoints.newest() is not None
+        if resumed:
+            abstract_state = jax.eval_shape(agent.init_state)
+            state, saved = checkpoints.restore(abstract_state, replay)
+            open_episodes = {
+                int(number): np.asarray(actions, np.float32)
+                for number, actions in saved.pop("open_episodes", {}).items()
+            }
+            counters = Counters(**saved)
+        else:
+            state = agent.init_state()
+        frame = counters.num_steps * config.action_repeat
+        if resumed:
+            say(f"resuming from the checkpoint of frame {frame}")
+        stopwatch = Stopwatch()
+        experts = agents.expert_episodes(agent.rewarder, demonstrations)
+        distance = None
+        if demonstrations is not None:
+            distance = ExpertDistance(config, workdir, demonstrations)
+        return cls(
+            config=config,
+            agent=agent,
+            state=state,
+            counters=counters,
+            episode_steps=environment.episode_steps,
+            player=assembly.make_player(
+                config,
+                environment,
+                first_episode=counters.num_episodes + len(open_episodes),
+                open_episodes=open_episodes,
+                timed=functools.partial(TimedPool, stopwatch=stopwatch),
+                say=say,
+            ),
+            replay=replay,
+            updates=Updates(config, agent, replay, demonstrations, experts),
+            experts=experts,
+            evaluator=Evaluator(
+                config,
+                agent,
+                assembly.evaluation_environment(config),
+                experts,
+                distance,
+            ),
+            checkpoints=checkpoints,
+            log=Outputs(
+                workdir,
+                config,
+                demonstrations,
+                frame if resumed else None,
+                owes_evaluation=counters.owes_evaluation,
+            ),
+            progress=ProgressLine(
+                config.total_frames, first_frame=frame, even_from=config.seed_frames
+            ),
+            stopwatch=stopwatch,
+        )

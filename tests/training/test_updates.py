@@ -45,7 +45,7 @@ def _nothing_is_simulated(monkeypatch):
 def make_run(folder, method="dac", **changes):
     folder.mkdir(exist_ok=True)
     config = make_config(method, **changes)
-    return train.Run(**parts.make_parts(config, folder, make_demonstrations(), print))
+    return train.Run.make(config, folder, make_demonstrations(), print)
 
 
 def act_until(run, num_steps):
