@@ -13,6 +13,7 @@ from jaxil.machine.screen import LastingStream
 _TTY_SECONDS = 0.2  # between updates of a terminal's line, and of the speed
 _PLAIN_SECONDS = 30.0  # between lines in a log file
 _WINDOW_SECONDS = 60.0  # over which the speed is measured
+_SETTLING_SECONDS = 25.0  # without a word on the time left
 _SPARKS = "▁▂▃▄▅▆▇█"
 _NUM_SPARKS = 16
 
@@ -36,8 +37,8 @@ class ProgressLine:
         Args:
           total_frames: environment frames at the end, >= 1.
           first_frame: where this process starts; not 0 after a resume.
-          even_from: frame from which the speed tells the time left; before it, as
-            long as nothing is learned, frames are faster.
+          even_from: frame from which the speed tells the time left, but for some
+            seconds: before it nothing is learned, then the learner is compiled.
           label: starts the line.
           unit: what is counted, if not environment frames.
           stream: None for stderr.
@@ -66,7 +67,9 @@ class ProgressLine:
         self._newest: Mapping[str, float] = {}  # of the returns
         self._history: list[float] = []
         self._even_from = even_from
-        self._is_even = first_frame >= even_from
+        self._is_even = even_from == 0
+        self._even_at = math.inf  # a time of the clock
+        self._speed = 0.0  # the last one known
         self._label = f"{label}: " if label else ""
         self._unit = unit
         self._clock = clock
@@ -99,8 +102,10 @@ class ProgressLine:
             return
         self._next_update = now + _TTY_SECONDS
         if not self._is_even and frame >= self._even_from:
-            self._is_even = True
-            self._progress.reset(self._task)  # the speed too
+            self._even_at = min(self._even_at, now + _SETTLING_SECONDS)
+            if now >= self._even_at:
+                self._is_even = True
+                self._progress.reset(self._task)  # the speed too
         self._progress.update(self._task, completed=frame)
         if self._live:
             if not self._progress.live.is_started:
@@ -128,7 +133,7 @@ class ProgressLine:
         self, now: float, seconds: Mapping[str, float], returns: Mapping[str, float]
     ) -> str:
         task = self._progress.tasks[0]
-        speed = task.speed or 0.0
+        self._speed = speed = task.speed or self._speed
         parts = [
             f"{self._label}{task.completed:.0f}/{task.total:.0f} {self._unit} "
             f"({task.percentage:.1f} %)",

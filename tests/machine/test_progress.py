@@ -103,13 +103,14 @@ def test_frames_before_anything_is_learned_tell_nothing_of_the_time_left():
     stream = io.StringIO()
     line, clock = make_line(stream, total_frames=10_000, even_from=4_000)
     frame = 0
-    for second in range(110):
+    for second in range(130):
         clock.seconds = second
-        frame += 100 if second < 40 else 10
+        if second < 40 or second >= 60:  # compiled in between
+            frame += 100 if second < 40 else 10
         line.update(frame, {})
-    shown = stream.getvalue().splitlines()
-    assert ["left" in text for text in shown] == [False, False, True, True]
-    assert "10 frames/s" in shown[2]  # of the last seconds, not of the last minute
+    shown = stream.getvalue().splitlines()  # after 3, 33, 63, 93 and 123 seconds
+    assert ["left" in text for text in shown] == [False, False, False, True, True]
+    assert "| 10 frames/s |" in shown[3]  # since it is compiled, not of a minute
 
 
 def test_speed_follows_a_change():
