@@ -4,6 +4,7 @@ import itertools
 import os
 import pathlib
 from typing import Any
+from unittest import mock
 
 import dm_env
 import numpy as np
@@ -92,7 +93,10 @@ def test_numbers_that_a_task_offers_are_numbers(name, value, monkeypatch):
     monkeypatch.setitem(globals(), "offering", lambda: task)
     with pytest.raises(ValueError, match=f"has {name}=.*number above 0"):
         _ = tasks.make_environment(f"{__name__}:offering", seed=0).step_seconds
+    closed = mock.create_autospec(task.close)
+    task.close = closed
     (fault,) = tasks.problems(f"{__name__}:offering", **settings())
+    closed.assert_called_once()
     assert f"has {name}=" in str(fault)
 
 
@@ -218,10 +222,14 @@ def test_every_environment_is_closed(num_environments, tmp_path, monkeypatch):
     train = (f"--config=drqv2:{task}", *small("drqv2"), f"--workdir={run}")
     several = f"--config.num_environments={num_environments}"
     output = f"--output={tmp_path / 'expert.npz'}"
+    once = ("--repeats=1", "--steps=2", "--nostart")
+    recorded = (f"--policy={__name__}:still", f"--task={task}", "--num_episodes=1")
     commands = [
         ("launch", *train, several),
         ("evaluate", f"--workdir={run}", "--num_episodes=1", trust),
         ("collect", f"--workdirs={run}", "--num_episodes=1", output, trust),
+        ("collect", *recorded, f"--output={tmp_path / 'other.npz'}"),
+        ("benchmark", *train[:-1], "--config.action_repeat=1", *once),
     ]
     if num_environments == 2:  # evaluation and recording take one
         commands = commands[:1]

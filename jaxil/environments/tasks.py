@@ -9,6 +9,7 @@ any other of dm_control, such as composer's, takes a camera but no distraction.
 """
 
 import atexit
+import contextlib
 import functools
 import math
 from typing import Any
@@ -54,14 +55,13 @@ def problems(task: str, **settings: Any) -> list[Fault]:
     if is_of_suite(task) and not settings["camera"]:
         return []
     try:
-        environment = make_environment(task, seed=0, **settings)
-        if not is_of_suite(task):
-            environment.reset(episode=0)
-            environment.step(np.zeros(environment.action_spec().shape))
-            _ = environment.step_seconds
-            if settings["observation"] == "pixels":
-                environment.frame()
-        environment.close()
+        with make_environment(task, seed=0, **settings) as environment:
+            if not is_of_suite(task):
+                environment.reset(episode=0)
+                environment.step(np.zeros(environment.action_spec().shape))
+                _ = environment.step_seconds
+                if settings["observation"] == "pixels":
+                    environment.frame()
     except UsageError as error:
         return [f if isinstance(f, Fault) else Fault("task", f) for f in error.faults]
     except (Exception, SystemExit) as error:  # whatever the user's task raises
@@ -92,6 +92,16 @@ def make_environment(
         simulator: Any = _Gymnasium(task.removeprefix(_GYMNASIUM), image_size)
     else:
         simulator = outside.load(task, "task")()
+    try:
+        return _wrapped(simulator, settings)
+    except BaseException:
+        with contextlib.suppress(Exception):  # the first error is the one to be told
+            simulator.close()
+        raise
+
+
+def _wrapped(simulator: Any, settings: dict[str, Any]) -> PixelEnvironment:
+    """Returns an environment of one that is not the suite's; takes its settings."""
     own_task = getattr(simulator, "task", None)
     if isinstance(getattr(own_task, "random", None), np.random.RandomState):
         return suite.wrap(simulator, **settings)
@@ -146,10 +156,8 @@ def make_recorded(
 def timing(task: str, action_repeat: int) -> tuple[float | None, int]:
     """Returns an agent step's seconds, None if unknown, and an episode's steps."""
     settings = {"action_repeat": action_repeat, "image_size": 8}
-    environment = make_environment(task, seed=0, **settings)
-    found = environment.step_seconds, environment.episode_steps
-    environment.close()
-    return found
+    with make_environment(task, seed=0, **settings) as environment:
+        return environment.step_seconds, environment.episode_steps
 
 
 class _DmControl:

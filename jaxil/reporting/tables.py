@@ -174,7 +174,8 @@ def aggregate_table(finals: Sequence[Final]) -> Table:
         rows.append({**row, "median": np.median(scores), "mean": scores.mean()})
     about = (
         "Seeds are resampled within each task (stratified bootstrap). Variants with "
-        "runs on different tasks cannot be compared here."
+        "runs on different tasks cannot be compared here. Settings may differ from "
+        "task to task, as those of presets do."
     )
     name = "Over all tasks, in shares of each expert"
     return Table("all_tasks", name, rows, about, in_shares=True)

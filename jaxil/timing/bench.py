@@ -1,5 +1,6 @@
 """A run whose parts can be called one at a time."""
 
+import contextlib
 import io
 import pathlib
 import time
@@ -62,6 +63,9 @@ class Bench:
         self._demonstrations = assembly.load_demonstrations(config)
         self.run = run = _Loop.make(config, folder, self._demonstrations, say)
         self._environment = assembly.training_environment(config)
+        self._closing = contextlib.ExitStack()
+        self._closing.callback(run.close)
+        self._closing.callback(self._environment.close)
         run.progress = ProgressLine(config.total_frames, stream=io.StringIO())
         self._rng = np.random.default_rng(0)
         self.episode = self._random_episode()
@@ -158,8 +162,8 @@ class Bench:
         return agent.update_step.lower(*shapes)
 
     def close(self) -> None:
-        """Ends worker processes and closes files."""
-        self.run.close()
+        """Ends worker processes, closes environments and files."""
+        self._closing.close()
 
     def _physics_step(self) -> Callable[[], Any] | None:
         """Returns a function that steps an environment without rendering.
@@ -173,6 +177,7 @@ class Bench:
             environment = assembly.training_environment(config)
         except ValueError:
             return None
+        self._closing.callback(environment.close)
         environment.reset(episode=0)
         action = np.zeros(environment.action_spec().shape)
         return lambda: environment.step(action)
