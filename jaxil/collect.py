@@ -33,6 +33,7 @@ from typing import Any
 from absl import flags
 
 from jaxil import command
+from jaxil.config import FIELDS
 from jaxil.errors import Fault, UsageError, told_as, unknown_name
 
 _NUM_EVAL_EPISODES = 10
@@ -66,8 +67,8 @@ def _record(values: flags.FlagValues) -> None:
     from jaxil.environments.evaluation import evaluate
     from jaxil.training import assembly, trained
 
-    runs = [trained.load(pathlib.Path(folder)) for folder in values.workdirs]
-    tasks = sorted({run.config.task for run in runs})
+    loaded = [trained.load(pathlib.Path(folder)) for folder in values.workdirs]
+    tasks = sorted({policy.config.task for policy, _ in loaded})
     if len(tasks) > 1:
         raise UsageError(
             f"--workdirs hold runs of different tasks ({', '.join(tasks)}); list runs "
@@ -75,26 +76,26 @@ def _record(values: flags.FlagValues) -> None:
         )
     means = []
     print(f"{'mean':>8}{'std':>8}{'frames':>10}{'minutes':>9}  run")
-    for folder, run in zip(values.workdirs, runs, strict=True):
-        with run.environment as environment:
+    for folder, (policy, environment) in zip(values.workdirs, loaded, strict=True):
+        with environment:
             evaluation = evaluate(
-                environment, run.act, num_episodes=_NUM_EVAL_EPISODES, first_episode=0
+                environment, policy, num_episodes=_NUM_EVAL_EPISODES, first_episode=0
             )
         means.append(evaluation.mean)
         print(
-            f"{evaluation.mean:>8.1f}{evaluation.std:>8.1f}{run.act.frame:>10}"
-            f"{run.act.seconds / 60:>9.0f}  {folder}",
+            f"{evaluation.mean:>8.1f}{evaluation.std:>8.1f}{policy.frame:>10}"
+            f"{policy.seconds / 60:>9.0f}  {folder}",
             flush=True,
         )
-    best = runs[int(np.argmax(means))]
+    best, _ = loaded[int(np.argmax(means))]
     with assembly.environment_with_seed(best.config, _SEED) as environment:
         _write(
             values,
             environment,
-            best.act,
+            best,
             task=best.config.task,
             action_repeat=best.config.action_repeat,
-            expert=f"{best.act.description()}; mean action, no noise",
+            expert=f"{best.description()}; mean action, no noise",
         )
 
 
@@ -138,13 +139,14 @@ def _write(
     action_repeat: int,
     expert: str,
 ) -> None:
-    """Plays and writes episodes: simulator states if the task has any, else pixels."""
+    """Plays and writes episodes: simulator states if possible, else pixels."""
     import numpy as np
 
     from jaxil.demonstrations import playing, states
     from jaxil.demonstrations.readers import own
     from jaxil.demonstrations.readers.recording import Recording
     from jaxil.environments.interaction import Restorable
+    from jaxil.machine import screen
 
     def decide(step: int, observation: Any) -> Any:
         with told_as("the policy", f"step {step}"):
@@ -154,6 +156,7 @@ def _write(
         return action
 
     output, returns = pathlib.Path(values.output), []
+    seconds = environment.step_seconds
     play: dict[str, Any] = {
         "environment": environment,
         "begin": lambda episode: decide,
@@ -161,8 +164,14 @@ def _write(
         "finished": lambda episode, task_return: returns.append(task_return),
     }
     try:
-        if isinstance(environment, Restorable):
-            arrays = playing.play(**play)
+        arrays = None
+        try:
+            if isinstance(environment, Restorable):
+                arrays = playing.play(**play)
+        except playing.LengthsDiffer as error:
+            screen.say(f"{error}, so pixels are recorded, not states")
+            returns.clear()
+        if arrays is not None:
             metadata = states.new_metadata(
                 task=task,
                 action_repeat=action_repeat,
@@ -175,7 +184,6 @@ def _write(
                 output, states.StateDemonstrations(**arrays, metadata=metadata)
             )
         else:
-            seconds = environment.step_seconds
             recording = Recording(
                 "jaxil pixels",
                 values.num_episodes,
@@ -327,20 +335,12 @@ def _define(values: flags.FlagValues) -> None:
     number("num_episodes", 50, "episodes to record", 1, 10_000)
     image_size = "of images; without it videos shrink to 84 or 160, pixels keep theirs"
     number("image_size", None, image_size, 8, 1024)
-    flags.DEFINE_enum(
-        "render_quality",
-        "paper",
-        ["paper", "fast", "smooth"],
-        "how --convert and --inspect render states",
-        flag_values=values,
-    )
-    flags.DEFINE_enum(
-        "fit",
-        "stretch",
-        ["stretch", "crop", "pad"],
-        "how --convert --image_size makes squares of frames that are not",
-        flag_values=values,
-    )
+    choices = functools.partial(flags.DEFINE_enum, flag_values=values)
+    quality, fit = FIELDS["render_quality"], FIELDS["demonstrations.fit"]
+    how = "how --convert and --inspect render states"
+    choices("render_quality", quality.default, quality.choices, how)
+    how = "how --convert --image_size makes squares of frames that are not"
+    choices("fit", fit.default, fit.choices, how)
     text("camera", help="of a LeRobot dataset with several")
     number("frame_skip", 1, "keeps every N-th frame of pixels", 1, 10_000)
 

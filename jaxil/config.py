@@ -6,7 +6,6 @@ Durations end in their unit: `_frames` are environment frames, before action rep
 """
 
 import functools
-import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -282,15 +281,6 @@ def _problems(
                 "agent step",
                 f"use {nearest}",
                 value,
-            )
-    if not {"max_episode_frames", "action_repeat", "replay_size_steps"} & bad:
-        longest = math.ceil(config.max_episode_frames / config.action_repeat)
-        if longest > config.replay_size_steps:
-            yield Fault(
-                "max_episode_frames",
-                "does not fit the replay, which must hold whole episodes",
-                f"use replay_size_steps={longest} or more",
-                config.max_episode_frames,
             )
     for start, end in _FALLING:
         first, last = read(config, start), read(config, end)

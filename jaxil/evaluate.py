@@ -30,38 +30,43 @@ def main(argv: list[str]) -> None:
     print(startup.prepare(), file=sys.stderr, flush=True)
     from jaxil.training import trained
 
-    run = trained.load(folder)
-    with run.environment:
-        _evaluate(values, folder, run)
+    policy, environment = trained.load(folder)
+    with environment:
+        _evaluate(values, folder, policy, environment)
 
 
-def _evaluate(values: flags.FlagValues, folder: pathlib.Path, run: Any) -> None:
-    """Prints the returns of a `Trained` policy, and films its first episode."""
+def _evaluate(
+    values: flags.FlagValues, folder: pathlib.Path, policy: Any, environment: Any
+) -> None:
+    """Prints the returns of a policy, and films its first episode."""
     from jaxil import config as jaxil_config
     from jaxil.demonstrations.states import DemonstrationError
     from jaxil.environments.evaluation import evaluate
     from jaxil.machine import screen
     from jaxil.training import assembly, film
 
-    films = assembly.renderer_name(run.config) != "none"
+    config = policy.config
+    films = assembly.renderer_name(config, films=False) != "none"
+    if not films:
+        screen.say("no video is written: nothing renders here, see jaxil doctor")
     evaluation = evaluate(
-        run.environment,
-        run.act,
+        environment,
+        policy,
         num_episodes=values.num_episodes,
         first_episode=_FIRST_EPISODE,
-        record=film.recorder(run.environment, values.video_size) if films else None,
+        record=film.recorder(environment, values.video_size) if films else None,
     )
     for number, task_return in enumerate(evaluation.task_returns):
         print(f"episode {number}: {task_return:.1f}")
     returns = evaluation.task_returns
     line = (
-        f"{run.config.method} on {run.config.task}, frame {run.act.frame}: mean "
+        f"{config.method} on {config.task}, frame {policy.frame}: mean "
         f"{evaluation.mean:.1f}, std {evaluation.std:.1f}, minimum {returns.min():.1f},"
         f" maximum {returns.max():.1f}"
     )
-    if jaxil_config.uses_demonstrations(run.config):
+    if jaxil_config.uses_demonstrations(config):
         try:
-            expert_return = assembly.expert_return(run.config)
+            expert_return = assembly.expert_return(config)
             if expert_return is not None:
                 line += f"; the expert's mean {expert_return:.1f}"
         except DemonstrationError as error:
@@ -70,37 +75,35 @@ def _evaluate(values: flags.FlagValues, folder: pathlib.Path, run: Any) -> None:
     print(line)
     if films:
         sides = film.sides(
-            run.config,
-            run.environment,
+            config,
+            environment,
             evaluation,
             first_episode=_FIRST_EPISODE,
             image_size=values.video_size,
             shows_progress=True,
         )
-        _write_videos(values, folder, run, sides)
+        stem = folder / "videos" / f"evaluation_{policy.frame:09d}"
+        _write_videos(stem, sides, gif=values.gif)
 
 
-def _write_videos(
-    values: flags.FlagValues, folder: pathlib.Path, run: Any, sides: list[Any]
-) -> None:
-    """Writes `film.Side`s beside each other."""
+def _write_videos(stem: pathlib.Path, sides: list[Any], *, gif: bool) -> None:
+    """Writes `film.Side`s beside each other: `stem`.mp4, and on request a GIF."""
     from jaxil.files import video
     from jaxil.training import run_log
 
     frames, captions = zip(*sides)
-    stem = folder / "videos" / f"evaluation_{run.act.frame:09d}"
     fps = run_log.frames_per_second(len(frames[0]))
-    film_file, gif = stem.with_suffix(".mp4"), stem.with_suffix(".gif")
+    film_file, gif_file = stem.with_suffix(".mp4"), stem.with_suffix(".gif")
     try:
         stem.parent.mkdir(exist_ok=True)
         video.write_video(film_file, *frames, fps=fps, labels=captions)
         print(f"video: {film_file}")
-        if values.gif:
+        if gif:
             stride = round(fps / _GIF_FPS)
             fewer = [each[::stride] for each in frames]
             texts = [each[::stride] for each in captions]
-            video.write_gif(gif, *fewer, fps=fps / stride, labels=texts)
-            print(f"gif: {gif}")
+            video.write_gif(gif_file, *fewer, fps=fps / stride, labels=texts)
+            print(f"gif: {gif_file}")
     except OSError as error:
         raise UsageError(
             f"{stem.parent} cannot be written ({error.strerror or error}); make room or"

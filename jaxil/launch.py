@@ -34,7 +34,7 @@ def main(argv: list[str]) -> int:
     devices.device_name()  # refuses a wrong JAX_PLATFORMS before anything is written
     for finding in doctor.memory(config):
         screen.say(str(finding))
-    gl_name = assembly.renderer_name(config)
+    gl_name = assembly.renderer_name(config, films=config.video_every_evals > 0)
     native = agents.uses_native_convolutions(config)
     description = provenance.describe(gl_name, native=native)
     with workdir.opened(folder):

@@ -11,7 +11,7 @@ from jaxil import doctor
 from jaxil.demonstrations import states
 from jaxil.environments import pixel_environment, suite
 from jaxil.errors import UsageError
-from jaxil.machine import devices, memory, provenance
+from jaxil.machine import devices, memory, provenance, startup
 
 
 @pytest.fixture(autouse=True)
@@ -293,6 +293,15 @@ def test_exit_status(few, capsys, levels, status):
     assert doctor.main(["doctor"]) == status
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["ok", *levels]
+
+
+def test_the_set_up_is_told_as_the_user_left_it(few, capsys, monkeypatch):
+    """`prepare` sets MUJOCO_GL, so that its second call would blame the user for it."""
+    few()
+    monkeypatch.delenv("MUJOCO_GL")
+    monkeypatch.setattr(startup, "gl_works", lambda backend: False)
+    assert doctor.main(["doctor"]) == 0
+    assert "no GL: `apt-get install" in capsys.readouterr().out
 
 
 def test_the_config_of_the_command_line_is_examined(monkeypatch, tmp_path):

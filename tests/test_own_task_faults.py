@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 from dm_env import specs
 
+from jaxil import config as jaxil_config
+from jaxil.demonstrations import foreign
 from jaxil.environments import tasks
 from jaxil.environments.pixel_environment import PixelEnvironment
+from jaxil.training import assembly
 from tests.commands import call, small
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -266,6 +269,44 @@ def test_an_error_in_closing_a_task_hides_no_other(monkeypatch, tmp_path, caplog
         assert "in close(): OSError: the simulator is gone (test_own" in caplog.text
         caplog.clear()
         assert ("NaN in the simulation" in ended.stderr) == (name == "exploding")
+
+
+def test_episodes_of_unequal_length_are_recorded_as_pixels(monkeypatch, tmp_path):
+    """A file of simulator states has one length."""
+
+    def falling():
+        from dm_control.suite import cartpole
+
+        environment, steps = cartpole.balance(), itertools.count()
+        ends = {2, 6}  # episodes of 3, 4, 3, 4 ... steps
+        environment.task.get_termination = lambda physics: (
+            0.0 if next(steps) % 7 in ends else None
+        )
+        return environment
+
+    monkeypatch.setitem(globals(), "falling", falling)
+    names = (f"--policy={__name__}:still", f"--task={__name__}:falling")
+    output = tmp_path / "out.npz"
+    words = ("--action_repeat=1", "--num_episodes=2", "--image_size=16")
+    ended = call("collect", *names, f"--output={output}", *words)
+    assert ended.returncode == 0, ended.stderr
+    assert "differ in length, so pixels are recorded" in ended.stderr
+    assert "2 episodes" in ended.stdout
+    recording = foreign.open_recording(output, max_bytes=2**24)
+    assert [len(episode.frames) for episode in recording.episodes] == [4, 5]
+
+
+def test_an_episode_longer_than_the_replay_is_said(monkeypatch):
+    task = Task()
+    task.step_limit = 5000  # pyright: ignore[reportAttributeAccessIssue]
+    name = f"{__name__}:long"
+    monkeypatch.setitem(globals(), "long", lambda: task)
+    config = jaxil_config.default_config("drqv2", name)
+    config.update(action_repeat=2, total_frames=10_000, replay_size_steps=2_000)
+    (fault,) = assembly.problems(config)
+    assert "less than an episode, which has 2500 agent steps" in str(fault)
+    config.max_episode_frames = 4_000
+    assert assembly.problems(config) == []
 
 
 def test_a_task_that_observes_images_alone_is_timed(monkeypatch):

@@ -38,7 +38,6 @@ _BAD_VALUES = (
     ("learning_rate_end", 2e-4, ("is above learning_rate=0.0001", "must not grow")),
     ("discriminator.batch_size", 512, ("at most 256",)),
     ("replay_size_steps", 10, ("replay_size_steps=10",)),
-    ("max_episode_frames", 400_000, ("use replay_size_steps=200000 or more",)),
     ("demonstrations.num_episodes", 0, ("demonstrations.num_episodes=0",)),
     ("updates_per_dispatch", 0, ("must lie in [1, 1000]",)),
     ("num_environments", 65, ("must lie in [1, 64]",)),
@@ -177,14 +176,14 @@ def test_a_folder_without_a_run_is_said(name, tmp_path):
 
 
 def test_a_video_that_cannot_be_written_costs_no_returns(tmp_path, monkeypatch):
-    run = types.SimpleNamespace(
-        config=jaxil_config.default_config("zero"),
-        environment=contextlib.nullcontext(),
-        act=types.SimpleNamespace(frame=2000),
+    policy = types.SimpleNamespace(
+        config=jaxil_config.default_config("zero"), frame=2000
     )
     played = evaluation.Evaluation([], np.array([3.0]), [])
-    monkeypatch.setattr(trained, "load", lambda folder: run)
-    monkeypatch.setattr(assembly, "renderer_name", lambda config: "a renderer")
+    monkeypatch.setattr(
+        trained, "load", lambda folder: (policy, contextlib.nullcontext())
+    )
+    monkeypatch.setattr(assembly, "renderer_name", lambda *_, **__: "a renderer")
     monkeypatch.setattr(evaluation, "evaluate", lambda *_, **__: played)
     monkeypatch.setattr(film, "recorder", lambda *_: None)
     sides = [(np.zeros((2, 16, 16, 3), np.uint8), ["", ""])]

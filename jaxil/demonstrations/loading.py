@@ -51,11 +51,13 @@ class Wanted(NamedTuple):
       num_episodes: the file's first ones.
       action_repeat: the agent's; a multiple of the one in a file of states. Rewards of
         merged steps are summed, and the first action is kept.
+      max_episode_frames: of the agent's episodes; 0: the task's own limit. A file whose
+        episodes have another length is warned of.
       image_size: height and width of the frames.
       observation: "pixels" or "state".
       frame_skip: keeps every n-th frame of a file of pixels.
       sampling: of a file of pixels; "time" takes the frame nearest to each agent step.
-      fit: one of `frames.FITS`: how frames of other shapes become squares.
+      fit: stretch, crop or pad: how frames of other shapes become squares.
       dataset_camera: of a dataset with several.
       stated_action_repeat: of a file of pixels that does not say it; 0 if unknown.
       takes_fewer: whether fewer episodes will do; the functions here set it where they
@@ -66,6 +68,7 @@ class Wanted(NamedTuple):
     task: str
     num_episodes: int = 10
     action_repeat: int = 2
+    max_episode_frames: int = 0
     image_size: int = 84
     observation: str = "pixels"
     frame_skip: int = 1
@@ -154,6 +157,7 @@ def load(
                 image_size=request.image_size,
                 task=request.task,
                 action_repeat=request.action_repeat,
+                max_episode_frames=request.max_episode_frames,
                 fit=request.fit,
             )
             mismatch.warn_of_expert(path, request.num_episodes, *loaded[:4])

@@ -12,7 +12,7 @@ from jaxil.errors import printable
 _RATE_TOLERANCE = 0.1  # relative, of a video's frame rate
 _LARGEST_ACTION = 1.001  # 1, with room for rounding
 _MAX_SHOWN = 10
-_FITS = {
+_FITS = {  # of `demonstrations.fit`
     "stretch": "squeezed into a square",
     "crop": "cut to the square in their middle",
     "pad": "with black bars",
@@ -29,6 +29,7 @@ def warn_of_pixels(
     image_size: int,
     task: str,
     action_repeat: int,
+    max_episode_frames: int,
     fit: str,
 ) -> None:
     """Warns where a file of pixels differs from the agent's settings.
@@ -55,7 +56,7 @@ def warn_of_pixels(
             f"{action_repeat}: adjust action_repeat or demonstrations.frame_skip."
         )
     speed = metadata["frames_per_second"]
-    seconds, episode_steps = tasks.timing(task, action_repeat)
+    seconds, episode_steps = tasks.timing(task, action_repeat, max_episode_frames)
     wanted = 1.0 / seconds if seconds else speed
     if speed and wanted and abs(speed / wanted - 1.0) > _RATE_TOLERANCE:
         messages.append(
@@ -68,7 +69,7 @@ def warn_of_pixels(
     if not repeat and not speed and longest != episode_steps:
         messages.append(
             f"{path} does not say its action repeat, and its longest episode has "
-            f"{longest} steps, but the task's {episode_steps} at "
+            f"{longest} steps, but the agent's {episode_steps} at "
             f"action_repeat={action_repeat}. State demonstrations.action_repeat."
         )
     messages += [f"{path}: {note}" for note in metadata["notes"]]

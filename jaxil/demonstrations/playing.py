@@ -14,18 +14,27 @@ Begin = Callable[[int], Decide]  # episode number -> its controller, after the r
 Finished = Callable[[int, float], None]  # episode number, return
 
 
+class LengthsDiffer(ValueError):
+    """Episodes have different lengths, which a file of states cannot hold."""
+
+
 def play(
     environment: Any, begin: Begin, num_episodes: int, finished: Finished
 ) -> dict[str, np.ndarray]:
     """Plays episodes 0 ... K - 1; returns the arrays of `StateDemonstrations`.
 
     `environment` is `Restorable`, and used by nothing else.
+
+    Raises:
+      LengthsDiffer: an episode ended sooner, or later, than the first.
     """
     episodes = []
     look = environment.simulator_state
     for states, actions, rewards in _played(
         environment, begin, num_episodes, finished, look
     ):
+        if episodes and len(actions) != len(episodes[0]["actions"]):
+            raise LengthsDiffer("episodes differ in length")
         played = {name: np.stack([each[name] for each in states]) for name in states[0]}
         episodes.append({**played, "actions": actions, "rewards": rewards})
     return {name: np.stack([each[name] for each in episodes]) for name in episodes[0]}

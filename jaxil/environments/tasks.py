@@ -153,10 +153,17 @@ def make_recorded(
 
 
 @functools.cache
-def timing(task: str, action_repeat: int) -> tuple[float | None, int]:
+def timing(
+    task: str, action_repeat: int, max_episode_frames: int = 0
+) -> tuple[float | None, int]:
     """Returns an agent step's seconds, None if unknown, and an episode's steps."""
-    settings = {"action_repeat": action_repeat, "image_size": 8}
-    with make_environment(task, seed=0, **settings) as environment:
+    with make_environment(
+        task,
+        seed=0,
+        image_size=8,
+        action_repeat=action_repeat,
+        max_episode_frames=max_episode_frames,
+    ) as environment:
         return environment.step_seconds, environment.episode_steps
 
 

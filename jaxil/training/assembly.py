@@ -48,6 +48,8 @@ def problems(config: Config) -> list[Fault]:
     bad = {fault.subject.partition(".")[0] for fault in faults}
     if not bad & {"task", *_environment_settings(config)}:
         found = tasks.problems(config.task, **_environment_settings(config))
+        if not found and "replay_size_steps" not in bad:
+            found = _replay_problems(config)
         faults += found
         bad |= {fault.subject for fault in found}
     if config.encoder.convolutions == "native" and "encoder" not in bad:
@@ -73,6 +75,19 @@ def problems(config: Config) -> list[Fault]:
     return faults
 
 
+def _replay_problems(config: Config) -> list[Fault]:
+    """Returns a fault if the replay cannot hold an episode of the task."""
+    if tasks.is_of_suite(config.task):  # episodes of 1000 frames, the smallest replay
+        return []
+    limit = config.max_episode_frames
+    _, steps = tasks.timing(config.task, config.action_repeat, limit)
+    if steps <= config.replay_size_steps:
+        return []
+    rule = f"is less than an episode, which has {steps} agent steps"
+    way_out = f"use {steps} or more, or a smaller max_episode_frames"
+    return [Fault("replay_size_steps", rule, way_out, config.replay_size_steps)]
+
+
 def demonstration_fault(config: Config) -> str | None:
     """Returns why a run cannot use its demonstrations; None if it can."""
     try:
@@ -86,8 +101,12 @@ def demonstration_fault(config: Config) -> str | None:
     return None
 
 
-def renderer_name(config: Config) -> str:
-    """Returns what GL calls the device that renders here; "none" if it is not needed.
+def renderer_name(config: Config, *, films: bool) -> str:
+    """Returns what GL calls the device that renders here; "none" if nothing does.
+
+    Args:
+      config: checked.
+      films: whether a run on state vectors has to render too, for its videos.
 
     Raises:
       UsageError: nothing here can render, but the run needs it.
@@ -96,7 +115,7 @@ def renderer_name(config: Config) -> str:
         try:
             return environment.renderer_name()
         except RuntimeError as error:
-            if config.observation == "state" and not config.video_every_evals:
+            if config.observation == "state" and not films:
                 return "none"
             way_out = ""
             if config.observation == "state":
@@ -237,6 +256,7 @@ def _file_settings(config: Config) -> dict[str, Any]:
         "stated_action_repeat": settings.action_repeat,
         "dataset_camera": settings.camera,
         "action_repeat": config.action_repeat,
+        "max_episode_frames": config.max_episode_frames,
         "image_size": config.image_size,
         "observation": config.observation,
         "frame_skip": settings.frame_skip,

@@ -2,7 +2,7 @@
 
 import os
 import pathlib
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -10,7 +10,6 @@ import numpy as np
 from jaxil import config as jaxil_config
 from jaxil import outside
 from jaxil.config import Config
-from jaxil.demonstrations.states import DemonstrationError
 from jaxil.environments import tasks
 from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.errors import UsageError
@@ -110,9 +109,22 @@ def load_policy(folder: str | os.PathLike) -> Policy:
     Raises:
       UsageError: there is no run, no checkpoint, or none can be read.
     """
-    devices.device_name()  # a wrong JAX_PLATFORMS is said first
     folder = pathlib.Path(folder).expanduser()
-    config = workdir.read_config(folder, imports_task=False)
+    return _policy(folder, workdir.read_config(folder, imports_task=False))
+
+
+def load(folder: pathlib.Path) -> tuple[Policy, PixelEnvironment]:
+    """Returns the policy of a run with an environment for its evaluation.
+
+    Raises:
+      UsageError: see `load_policy`, or the task is code that only the folder names.
+    """
+    policy = _policy(folder, workdir.read_config(folder))
+    return policy, assembly.evaluation_environment(policy.config)
+
+
+def _policy(folder: pathlib.Path, config: Config) -> Policy:
+    devices.device_name()  # a wrong JAX_PLATFORMS is said first
     faults = jaxil_config.problems(config, known_tasks=(config.task,))
     if faults:
         raise UsageError(f"{folder / 'config.json'}: {'; '.join(map(str, faults))}")
@@ -120,35 +132,12 @@ def load_policy(folder: str | os.PathLike) -> Policy:
         params, mean, counters = Checkpoints(folder).read_policy()
     except CheckpointError as error:
         raise UsageError(str(error)) from error
-    if config.encoder.subtract_mean_image and mean is None:  # of an earlier version
-        try:
-            mean = agents.mean_image(config, assembly.load_demonstrations(config))
-        except DemonstrationError as error:
-            raise UsageError(
-                f"the checkpoint has no mean image, and {error}"
-            ) from error
+    if config.encoder.subtract_mean_image and mean is None:
+        raise UsageError(
+            f"{folder}: the checkpoint lacks the mean image that the encoder subtracts"
+        )
     head = params["actor"]["params"]["head"]
     (action_dim,) = head["output"]["bias"].shape
     networks = agents.make_networks(config, action_dim, 0.5 if mean is None else mean)
     params = jax.tree.map(jax.numpy.asarray, params)
     return Policy(config, networks, LearnerParams(**params), counters)
-
-
-class Trained(NamedTuple):
-    """A learned policy, and what it takes to play it."""
-
-    config: Config
-    act: Policy
-    environment: PixelEnvironment  # a separate one, not the training's
-
-
-def load(folder: str | os.PathLike) -> Trained:
-    """Returns the policy with an environment.
-
-    Raises:
-      UsageError: see `load_policy`, or the task is code that only the folder names.
-    """
-    workdir.read_config(pathlib.Path(folder))  # refuses such code before it is imported
-    policy = load_policy(folder)
-    environment = assembly.evaluation_environment(policy.config)
-    return Trained(policy.config, policy, environment)

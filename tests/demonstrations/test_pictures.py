@@ -133,7 +133,10 @@ def test_what_cannot_be_learned_from_is_warned_of(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         load(still)
     assert "nothing ever changes: 0" in caplog.text
-    assert "3 steps, but the task's 500" in caplog.text
+    assert "3 steps, but the agent's 500" in caplog.text
+    caplog.clear()
+    load(still, max_episode_frames=6)  # three agent steps
+    assert "but the agent's" not in caplog.text
     own = tmp_path / "own.npz"
     foreign_files.write_own(own, 1)
     with np.load(own) as stored:

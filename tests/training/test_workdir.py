@@ -8,8 +8,9 @@ import pytest
 
 from jaxil import config as jaxil_config
 from jaxil import outside
+from jaxil.environments.suite import SuiteEnvironment
 from jaxil.errors import UsageError
-from jaxil.training import trained, workdir
+from jaxil.training import assembly, trained, workdir
 from tests.tiny_agent import NETWORKS, make_params
 
 
@@ -130,6 +131,34 @@ def test_a_policy_makes_no_task_of_code_that_its_run_alone_names(tmp_path, monke
     monkeypatch.setattr(outside, "_trusted", {config.task})
     with pytest.raises(UsageError, match="SystemExit: imported"):
         policy.make_environment()
+
+
+def test_a_policy_without_its_mean_image_is_refused(tmp_path, monkeypatch):
+    """Made anew from the demonstrations, it would run the task that a folder names."""
+    config = jaxil_config.default_config("pdac")
+    config.encoder.subtract_mean_image = True
+    config.task = "harmful:make"
+    write(tmp_path, config.to_dict())
+    monkeypatch.setattr(
+        trained.Checkpoints, "read_policy", lambda self: ({}, None, {"num_steps": 0})
+    )
+    with pytest.raises(UsageError, match="lacks the mean image"):
+        trained.load_policy(tmp_path)
+
+
+def test_nothing_that_renders_stops_only_what_has_to_render(monkeypatch):
+    def fail(self):
+        raise RuntimeError("nothing here can render")
+
+    config = jaxil_config.default_config("zero")
+    config.observation = "state"
+    monkeypatch.setattr(SuiteEnvironment, "renderer_name", fail)
+    assert assembly.renderer_name(config, films=False) == "none"
+    with pytest.raises(UsageError, match="video_every_evals=0 needs no rendering"):
+        assembly.renderer_name(config, films=True)
+    config.observation = "pixels"
+    with pytest.raises(UsageError, match=r"nothing here can render$"):
+        assembly.renderer_name(config, films=False)
 
 
 def test_an_open_folder_is_in_use(tmp_path):

@@ -8,7 +8,6 @@ from PIL import Image, ImageOps
 
 from jaxil.demonstrations.readers.recording import FormatError, ReadOptions
 
-FITS = ("stretch", "crop", "pad")
 _MAX_CHANNELS = 30  # of ten frames; a longer axis is the height or width
 
 

@@ -37,7 +37,7 @@ class ReadOptions(NamedTuple):
     frame_skip: int = 1  # keeps every n-th frame; videos skip as they are read
     image_size: int | None = None  # height and width; None keeps the file's
     keep_aspect: bool = False  # only shrinks, until the shorter side is `image_size`
-    fit: str = "stretch"  # one of `frames.FITS`: how other shapes become squares
+    fit: str = "stretch"  # stretch, crop or pad: how other shapes become squares
     camera: str = ""  # of a dataset with several
 
     def check_bytes(self, name: str, num_bytes: int, way_out: str = "") -> None:
