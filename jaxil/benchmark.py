@@ -19,6 +19,7 @@ from absl import flags
 
 from jaxil import command
 from jaxil.errors import UsageError, unknown_name
+from jaxil.files.settings import flat
 
 _EXAMPLE = "such as --sweep=batch_size:64,128,256"
 
@@ -69,12 +70,10 @@ def main(argv: list[str]) -> None:
 
 def _swept(text: str, config: Any) -> tuple[str, dict[int | float, Any]]:
     """Reads FIELD:VALUE,VALUE,...; returns the field, and checked configs by value."""
-    from flax.traverse_util import flatten_dict
-
     from jaxil.training import assembly
 
     field, _, words = text.partition(":")
-    fields: Any = flatten_dict(config.to_dict(), sep=".")
+    fields = flat(config.to_dict())
     kinds = {n: type(v) for n, v in fields.items() if type(v) in (int, float)}
     if field not in kinds:
         fault = unknown_name("--sweep", field, tuple(kinds))

@@ -300,13 +300,11 @@ def _change_method(config: Config, method: str) -> None:
         config[section] = {
             name: changed.get(name, field.default) for name, field in fields.items()
         }
-    declared = methods.get(method)
-    if not declared.plays:
-        per_update = config.update_every_steps * config.action_repeat
-        config.total_frames = declared.total_updates * per_update
+    config.method = method
+    if not methods.get(method).plays:
+        config.total_frames = jaxil_config.frames_of_updates(config)
     elif not before.plays:
         config.total_frames = wanted.total_frames
-    config.method = method
 
 
 def _override(config: Config, field: str, text: str) -> Iterable[Fault]:

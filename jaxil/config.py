@@ -205,9 +205,14 @@ def defaults(method: str, task: str) -> Config:
     config.total_frames = _EASY_FRAMES if task in _EASY_TASKS else _HARD_FRAMES
     config.num_steps = 1 if task.startswith("walker") else 3
     if not declared.plays:
-        per_update = config.update_every_steps * config.action_repeat
-        config.total_frames = declared.total_updates * per_update
+        config.total_frames = frames_of_updates(config)
     return config
+
+
+def frames_of_updates(config: Config) -> int:
+    """Returns the length of a run of a method that does not play."""
+    per_update = config.update_every_steps * config.action_repeat
+    return methods.get(config.method).total_updates * per_update
 
 
 def fields(method: str) -> dict[str, Field]:

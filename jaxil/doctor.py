@@ -26,7 +26,6 @@ from jaxil.machine import devices, startup
 from jaxil.machine import memory as host_memory
 
 _GL_INSTALL = f"apt-get install {' '.join(startup.GL_PACKAGES)}"
-_SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "software")
 _JAXLIB = "jaxlib>=0.10,<0.13"  # installed by jax
 _NUM_FRAMES = 50  # timed per quality
 _SLOW_FRAME_MS = 8.0
@@ -117,7 +116,7 @@ def convolutions(_: Any) -> Iterator[Finding]:
 
 def rendering(config: Any) -> Iterator[Finding]:
     """Renders at each quality and times it."""
-    from jaxil.environments.camera import RENDER_QUALITIES
+    from jaxil.environments.camera import RENDER_QUALITIES, renders_in_software
 
     backend, size = os.environ.get("MUJOCO_GL", ""), config.image_size
     try:
@@ -131,7 +130,7 @@ def rendering(config: Any) -> Iterator[Finding]:
     yield Finding("ok", "MUJOCO_GL", backend)
     name, _ = times["paper"]
     advice = ""
-    in_software = any(word in name.lower() for word in _SOFTWARE_RENDERERS)
+    in_software = renders_in_software(name)
     if in_software and devices.has_cuda_device():
         name += ": renders on the CPU, although there is a CUDA device"
         advice = "install the NVIDIA driver's EGL (libnvidia-gl); start a container "

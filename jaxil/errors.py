@@ -79,7 +79,7 @@ class UsageError(Exception):
 
 
 class RunFailed(RuntimeError):
-    """What was begun cannot go on; the message says why."""
+    """The run cannot continue; the message says why."""
 
 
 class EnvironmentsFailed(RunFailed):
@@ -100,7 +100,7 @@ def told_as(who: str, what: str) -> Iterator[None]:
 
     Args:
       who: "the task" or "the policy", for the message.
-      what: was being done.
+      what: what was being done.
     """
     try:
         yield
@@ -112,7 +112,7 @@ def told_as(who: str, what: str) -> Iterator[None]:
 
 
 def raised(error: BaseException) -> str:
-    """Returns what code that jaxil called raised, and the user's line nearest to it.
+    """Describes an error of code that jaxil called, with the user's nearest line.
 
     A ValueError that jaxil itself raised is given as it is: it says what is wrong.
     """

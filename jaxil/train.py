@@ -91,9 +91,8 @@ class Run(Parts):
             self.progress.update(self.frame, self.stopwatch.seconds, self.returns)
         self.stopwatch.timed("update", self.flush)()
 
-    def wants_episode(self, number: int) -> bool:
+    def wants_episode(self) -> bool:
         """Returns whether the budget has room for an episode beside the open ones."""
-        del number
         assert self.player is not None
         left = self.player.steps_left(self.episode_steps)
         return self.frame + left * self.config.action_repeat < self.config.total_frames

@@ -195,7 +195,7 @@ def load(
 
 
 def _request(wanted: dict[str, Any]) -> Wanted:
-    """Returns the fields with defaults; a number that nobody asked for may be less."""
+    """Returns the request; without `num_episodes`, a file with fewer will do."""
     return Wanted(**{"takes_fewer": "num_episodes" not in wanted, **wanted})
 
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from jaxil.environments import suite, tasks
+from jaxil.environments.camera import renders_in_software
 from jaxil.environments.pool import interrupts_blocked
 from jaxil.files import archive
 from jaxil.machine.cache import cache_folder
@@ -28,7 +29,6 @@ _MAX_PROCESSES = 8  # each takes about 250 MB
 # Takes seconds in software. Fewer pixels are rendered before a process has started.
 _MIN_PARALLEL_PIXELS = 2_000_000
 _TIMEOUT_SECONDS = 1800.0  # for the next episode of any process
-_SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer")
 
 States = dict[str, np.ndarray]  # `qpos`, `qvel` and `act` of one episode, [N + 1, n]
 
@@ -156,7 +156,7 @@ def observe_episodes(
 def num_processes(num_pixels: int, gl_name: str) -> int:
     """Returns how many processes render so many pixels in the shortest time."""
     # One process is fast enough on a GPU, where parallel EGL contexts may hang.
-    is_software = any(name in gl_name.lower() for name in _SOFTWARE)
+    is_software = renders_in_software(gl_name)
     if not is_software or num_pixels < _MIN_PARALLEL_PIXELS:
         return 1
     return min(len(os.sched_getaffinity(0)), _MAX_PROCESSES)
@@ -287,7 +287,7 @@ def _read_cached(path: pathlib.Path, images: np.ndarray) -> bool:
 def _write_cached(path: pathlib.Path, images: np.ndarray) -> None:
     """Stores images, or warns."""
     try:
-        archive.write_archive(path, [("images", images)], compressed=False)
+        archive.write_archive(path, [("images", images)], level=0)
     except OSError as error:
         _logger.warning(
             "images are not cached and will be rendered again: %s. Set "

@@ -12,9 +12,17 @@ _FAST_FLAGS = {"shadow": False, "reflection": False}
 # pixels, and small images do not show its speed.
 _SMOOTH_FACTOR = 2
 
+# What GL calls renderers that use no GPU.
+_SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software")
+
 # (physics, height and width in pixels, camera index) -> dm_control `Camera`. Raises
 # RuntimeError or ImportError without usable GL.
 OpenCamera = Callable[[Any, int, int], Any]
+
+
+def renders_in_software(gl_name: str) -> bool:
+    """Returns whether a renderer, as GL calls it, uses no GPU."""
+    return any(word in gl_name.lower() for word in _SOFTWARE)
 
 
 class Renderer:

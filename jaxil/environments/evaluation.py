@@ -45,7 +45,7 @@ def evaluate(
     """Plays whole episodes.
 
     Args:
-      environment: an `Environment` used by nothing else.
+      environment: used by nothing else.
       act: the policy.
       num_episodes: at least 1.
       first_episode: number of the first episode; it determines the initial states.
@@ -58,7 +58,7 @@ def evaluate(
     while len(episodes) < num_episodes:
         if stop_asked():
             raise Stopped
-        began = player.begin(lambda _: True)
+        began = player.begin(lambda: True)
         records = record if not episodes else None
         if records and began:
             recorded.append(records())

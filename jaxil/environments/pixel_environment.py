@@ -21,7 +21,7 @@ _logger = logging.getLogger(__name__)
 
 
 class PixelEnvironment(dm_env.Environment):
-    """Any dm_env environment as an `interaction.Environment`.
+    """Any dm_env environment in agent steps, with stacked images or states.
 
     One agent step is `action_repeat` environment frames. An observation is the last
     `frame_stack` images, uint8 [H, W, 3 * frame_stack], oldest first; at a reset the

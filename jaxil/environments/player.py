@@ -84,6 +84,8 @@ class _Open:
 class Player:
     """Plays episodes: `begin`, `step`, then `observe`, again and again.
 
+    Attribute `next_episode` is the number of the first episode that has not begun.
+
     Episode i starts from the state that `reset(episode=i)` gives, whichever
     environment plays it. A lost environment's episode is played again from its start.
     """
@@ -104,15 +106,15 @@ class Player:
             process had begun: they are repeated, and the episodes go on from there.
         """
         self._environments = environments
-        self._next_episode = first_episode
+        self.next_episode = first_episode
         self._waiting = dict(open_episodes or {})  # to be begun first
         self._open: dict[int, _Open] = {}  # by environment
 
-    def begin(self, wanted: Callable[[int], bool]) -> bool:
+    def begin(self, wanted: Callable[[], bool]) -> bool:
         """Starts an episode in each free environment; returns whether any began.
 
         Args:
-          wanted: asked for each new episode, by its number, whether to play it.
+          wanted: asked before each new episode whether to play another.
 
         Raises:
           EnvironmentsFailed: see `observe`.
@@ -121,11 +123,11 @@ class Player:
         for index in range(self._environments.size):
             if index in self._open:
                 continue
-            number = min(self._waiting, default=self._next_episode)
-            if number not in self._waiting and not wanted(number):
+            number = min(self._waiting, default=self.next_episode)
+            if number not in self._waiting and not wanted():
                 break
-            if number == self._next_episode:
-                self._next_episode += 1
+            if number == self.next_episode:
+                self.next_episode += 1
             self._environments.reset(index, number)
             self._open[index] = _Open(number, self._waiting.pop(number, np.zeros(0)))
             begun.append(index)

@@ -51,21 +51,16 @@ class Pool:
         size: int,
         *,
         say: Callable[[str], None],
-        step_seconds: float = _STEP_SECONDS,
-        start_seconds: float = _START_SECONDS,
     ) -> None:
         """Starts the processes without waiting for them.
 
         Args:
-          make: makes an `interaction.Environment`; pickled by name.
+          make: makes a `PixelEnvironment`; pickled by name.
           size: number of environments.
           say: receives a message when a process is replaced.
-          step_seconds: time limit of a reset or a step.
-          start_seconds: time limit of a process's first reset.
         """
         self.size = size
         self._make, self._say = make, say
-        self._step_seconds, self._start_seconds = step_seconds, start_seconds
         self._workers: dict[int, _Worker] = {}  # by index
         self._reasons: dict[int, str] = {}  # of the last loss
         self._losses = [0] * size
@@ -101,7 +96,7 @@ class Pool:
         Raises EnvironmentsFailed for an error of the environment or repeated losses.
         """
         worker = self._workers[index]
-        seconds = self._step_seconds if worker.has_answered else self._start_seconds
+        seconds = _STEP_SECONDS if worker.has_answered else _START_SECONDS
         answer = worker.receive(seconds)
         if isinstance(answer, Moment):
             if answer.is_last:

@@ -130,14 +130,20 @@ def write_archive(
     path: pathlib.Path,
     arrays: Iterable[tuple[str, np.ndarray]],
     *,
-    compressed: bool = True,
+    level: int = 6,
 ) -> None:
-    """Writes named arrays atomically; only one at a time has to be in memory."""
-    method = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
+    """Writes named arrays atomically; only one at a time has to be in memory.
+
+    Args:
+      path: its folder is created.
+      arrays: by name.
+      level: of compression: 0 for none, 9 for most.
+    """
+    method = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
     path.parent.mkdir(parents=True, exist_ok=True)
     with (
         writing.replacing(path) as temporary,
-        zipfile.ZipFile(temporary, "w", method) as archive,
+        zipfile.ZipFile(temporary, "w", method, compresslevel=level) as archive,
     ):
         for name, array in arrays:
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:

@@ -9,10 +9,7 @@ import time
 import uuid
 from collections.abc import Iterator
 
-# Temporary names of this and earlier versions.
-_TEMPORARY = re.compile(
-    r"\.tmp-.*|\.(saving|deleting|writing)_.*|\..*\.tmp(\.mp4)?|config\.json\.\d+\.tmp"
-)
+_TEMPORARY = re.compile(r"\.tmp-.*|\.deleting_.*")
 
 
 @contextlib.contextmanager

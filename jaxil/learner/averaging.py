@@ -37,7 +37,7 @@ def average_policy(
 
 def begin_average(state: TrainState) -> TrainState:
     """Returns the state with its newest policy as the first average."""
-    return state.replace(average=PolicyParams(*map(copy_params, state.newest_policy)))
+    return state.replace(average=copy_params(state.newest_policy))
 
 
 def make_averaging_step(step: UpdateStep, *, tau: float) -> UpdateStep:

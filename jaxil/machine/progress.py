@@ -26,7 +26,7 @@ class ProgressLine:
         total_frames: int,
         *,
         first_frame: int = 0,
-        even_from: int = 0,
+        steady_from: int = 0,
         label: str = "",
         unit: str = "frames",
         stream: TextIO | None = None,
@@ -37,8 +37,8 @@ class ProgressLine:
         Args:
           total_frames: environment frames at the end, >= 1.
           first_frame: where this process starts; not 0 after a resume.
-          even_from: frame from which the speed tells the time left, but for some
-            seconds: before it nothing is learned, then the learner is compiled.
+          steady_from: the time left is shown from some seconds after this frame on:
+            before it nothing is learned, and right after it the learner is compiled.
           label: starts the line.
           unit: what is counted, if not environment frames.
           stream: None for stderr.
@@ -66,9 +66,9 @@ class ProgressLine:
         )
         self._newest: Mapping[str, float] = {}  # of the returns
         self._history: list[float] = []
-        self._even_from = even_from
-        self._is_even = even_from == 0
-        self._even_at = math.inf  # a time of the clock
+        self._steady_from = steady_from
+        self._is_steady = steady_from == 0
+        self._steady_at = math.inf  # a time of the clock
         self._speed = 0.0  # the last one known
         self._label = f"{label}: " if label else ""
         self._unit = unit
@@ -101,10 +101,10 @@ class ProgressLine:
         if now < self._next_update:
             return
         self._next_update = now + _TTY_SECONDS
-        if not self._is_even and frame >= self._even_from:
-            self._even_at = min(self._even_at, now + _SETTLING_SECONDS)
-            if now >= self._even_at:
-                self._is_even = True
+        if not self._is_steady and frame >= self._steady_from:
+            self._steady_at = min(self._steady_at, now + _SETTLING_SECONDS)
+            if now >= self._steady_at:
+                self._is_steady = True
                 self._progress.reset(self._task)  # the speed too
         self._progress.update(self._task, completed=frame)
         if self._live:
@@ -147,7 +147,7 @@ class ProgressLine:
         if returns:
             shown = " ".join(f"{name} {value:.1f}" for name, value in returns.items())
             parts.append(f"return {shown} {_sparkline(self._history)}".rstrip())
-        if speed > 0 and self._is_even and not task.finished:
+        if speed > 0 and self._is_steady and not task.finished:
             parts.append(f"{duration((task.remaining or 0.0) / speed)} left")
         return " | ".join(parts)
 

@@ -186,7 +186,6 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     for section in (config.get("sinkhorn", {}), config.get("coverage", {})):
         if "target_update_steps" in section:
             section.update(_TARGETS[config.action_repeat])
-    declared = methods.get(method)
-    if not declared.plays:  # as many updates as with the paper's settings
-        config.total_frames = declared.total_updates * config.action_repeat
+    if not methods.get(method).plays:  # as many updates as with the paper's settings
+        config.total_frames = jaxil_config.frames_of_updates(config)
     return config

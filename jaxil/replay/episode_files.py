@@ -2,9 +2,6 @@
 
 import pathlib
 import re
-import zipfile
-
-import numpy as np
 
 from jaxil.errors import printable
 from jaxil.files import archive, untrusted, writing
@@ -16,22 +13,13 @@ _NAME = re.compile(r"episode_(\d{8,})\.npz")
 
 def write(folder: pathlib.Path, replay: Replay, index: int) -> int:
     """Writes one stored episode; returns the file's CRC-32."""
-    arrays = replay.episode(index)._asdict()
-    # np.savez_compressed uses level 6: far slower, hardly smaller.
-    with (
-        writing.replacing(_path(folder, index)) as temporary,
-        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file,
-    ):
-        for name, array in arrays.items():
-            with file.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(
-                    member, np.asanyarray(array), allow_pickle=False
-                )
-    return untrusted.checksum(_path(folder, index))
+    path, arrays = _path(folder, index), replay.episode(index)._asdict()
+    archive.write_archive(path, arrays.items(), level=1)  # 6: far slower, hardly less
+    return untrusted.checksum(path)
 
 
 def read_into(
-    replay: Replay, folder: pathlib.Path, index: int, checksum: int | None
+    replay: Replay, folder: pathlib.Path, index: int, checksum: int
 ) -> str | None:
     """Adds one episode, or skips its number if the file is damaged.
 
@@ -39,7 +27,7 @@ def read_into(
       replay: that the episode is added to.
       folder: of the files.
       index: the episode's number.
-      checksum: what `write` returned; None if that is unknown.
+      checksum: what `write` returned.
 
     Returns:
       What is wrong with the file, or None.
@@ -49,7 +37,7 @@ def read_into(
         limits = dict.fromkeys(Episode._fields, archive.MAX_BYTES)
         arrays = archive.read_archive(path, max_bytes=limits)
         # Zip's own checksums miss a file that was swapped for another.
-        if checksum not in (None, untrusted.checksum(path)):
+        if checksum != untrusted.checksum(path):
             raise ValueError("has changed since it was written")
         replay.add_episode(**arrays)
     except (OSError, ValueError) as error:

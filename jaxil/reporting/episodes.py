@@ -150,8 +150,6 @@ def _sheet(path: pathlib.Path, name: str, colour: str) -> Sheet | None:
         )
         panels.append(Panel("rewards", draw, _REWARD_HEIGHT, margins))
     if plan.any():
-        # Older runs padded the plan to the longest demonstration.
-        plan = plan[:, : np.flatnonzero(plan.any(axis=0))[-1] + 1]
         draw = functools.partial(plots.plan, weights=plan, step_seconds=step_seconds)
         panels.append(Panel("transport plan", draw, _PLAN_HEIGHT, margins))
         if {"agent_strip", "expert_strip"} <= stored.keys():

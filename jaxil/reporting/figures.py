@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 from jaxil import methods
 from jaxil.errors import UsageError
+from jaxil.files.settings import flat
 from jaxil.methods import Method, Variation
 
 TASKS = (  # in the paper's order
@@ -165,9 +166,10 @@ def variant_of(config: Mapping[str, Any]) -> Variant:
       config: nested, as `config.json` holds it. Fields that it lacks, because an
         older jaxil wrote it, have their defaults.
     """
-    overrides = {}
+    overrides, stored = {}, flat(config)
     for field, plain, _ in _variations(config["method"]):
-        value = _read(config, field, plain)
+        value = stored.get(field, plain)
+        value = tuple(value) if isinstance(value, list) else value
         # Another padding than 0 is a setting, not an ablation.
         changed = value == 0 if field == "shift_padding" else value != plain
         if changed:
@@ -189,12 +191,3 @@ def _variations(method: str) -> list[Variation]:
     declared = declaration(method)
     demonstrations = [_DEMONSTRATIONS_VARIATION] * declared.uses_demonstrations
     return [*demonstrations, *declared.variations, _AUGMENTATION_VARIATION]
-
-
-def _read(config: Mapping[str, Any], field: str, default: Any) -> Any:
-    value: Any = config
-    for part in field.split("."):
-        if not isinstance(value, Mapping) or part not in value:
-            return default
-        value = value[part]
-    return tuple(value) if isinstance(value, list) else value

@@ -10,7 +10,8 @@ from jaxil.maths import components, stacking
 from jaxil.maths.types import AnyEpisode, ExpertEpisodes
 from jaxil.rewarders.discrimination import scaled
 
-# Four episodes, usual before the first update, weigh as much as all demonstrations.
+# The four episodes that usually come before the first update weigh as much together
+# as all demonstrations.
 _DEMONSTRATION_ROWS, _EPISODE_ROWS = 1024, 256
 _NORM = 8.0  # of an observation's code, root mean square: penalties depend on it
 _SMALLEST_SCALE = 1e-3  # anything smaller is rounding, which must not be magnified

@@ -39,18 +39,18 @@ class Matching(NamedTuple):
           expert_moments: how many of a demonstration's N are not padding. Shape [K].
 
         Returns:
-          Rewards of the agent's observations, see `closest_rewards`; 0 for padding.
-          Shape [T].
+          Rewards of the agent's observations, see `closest`; 0 for padding. Shape [T].
         """
         pairs = self._costs_and_plans(agent, agent_moments, experts, expert_moments)
-        return closest_rewards(*pairs)
+        return closest(*pairs)[0]
 
     def closest_plan(
         self, agent: Array, agent_moments: Array, experts: Array, expert_moments: Array
     ) -> tuple[Array, Array]:
         """Returns the plan behind `rewards`, [T, N], and its demonstration's index."""
         pairs = self._costs_and_plans(agent, agent_moments, experts, expert_moments)
-        return cheapest(*pairs)
+        _, plan, index = closest(*pairs)
+        return plan, index
 
     def _costs_and_plans(
         self, agent: Array, agent_moments: Array, experts: Array, expert_moments: Array
@@ -68,13 +68,7 @@ class Matching(NamedTuple):
         return jax.vmap(match)(experts, expert_moments)
 
 
-def cheapest(costs: Array, plans: Array) -> tuple[Array, Array]:
-    """Returns the cheapest plan, [T, N], and its index; both arguments [K, T, N]."""
-    index = jnp.argmin(jnp.sum(costs * plans, axis=(1, 2)))
-    return plans[index], index
-
-
-def closest_rewards(costs: Array, plans: Array) -> Array:
+def closest(costs: Array, plans: Array) -> tuple[Array, Array, Array]:
     """Returns transport rewards to the demonstration that is cheapest to reach.
 
         k* = argmin_k <C_k, P_k>,    r_t = - sum_n C_k*tn P_k*tn
@@ -88,13 +82,14 @@ def closest_rewards(costs: Array, plans: Array) -> Array:
       plans: one for each demonstration. Shape [K, T, N].
 
     Returns:
-      Rewards of the agent's T observations. Shape [T].
+      Rewards of the agent's T observations [T], the plan behind them [T, N] and k* [].
 
     Source: Cohen et al. 2021, eq. (5); siddhanthaldar/ROT, agent/potil.py.
     """
     chex.assert_rank([costs, plans], 3)
     candidates = jax.vmap(transport.transport_rewards)(costs, plans)
-    return candidates[jnp.argmax(jnp.sum(candidates, axis=1))]
+    index = jnp.argmax(jnp.sum(candidates, axis=1))
+    return candidates[index], plans[index], index
 
 
 def scale_of_first_episode(

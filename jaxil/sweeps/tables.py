@@ -31,7 +31,7 @@ _GUESSES = {
     ("paper", "GPU"): 220.0,
     ("tiny", "GPU"): 220.0,
 }
-_ENOUGH_SECONDS = 60.0  # a younger run has mostly compiled
+_ENOUGH_SECONDS = 60.0  # until then a run has mostly compiled
 _ENDS = (State.FINISHED, State.FAILED, State.DAMAGED)
 
 

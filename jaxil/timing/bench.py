@@ -30,9 +30,8 @@ class _Loop(train.Run):
         if self.waits:
             jax.block_until_ready(self.state.num_updates)
 
-    def wants_episode(self, number: int) -> bool:
-        del number  # even if the budget is less than an episode
-        return True
+    def wants_episode(self) -> bool:
+        return True  # even if the budget is less than an episode
 
     def evaluate(self) -> None:
         pass
@@ -84,7 +83,7 @@ class Bench:
         self.first_update_seconds = time.perf_counter() - begin
         if run.player is not None and config.num_environments > 1:
             # Start the workers and compile their policy before anything is timed.
-            run.player.begin(lambda _: True)
+            run.player.begin(lambda: True)
             run.act(run.player.observations)
 
     def parts(self) -> dict[str, tuple[Callable[[], Any] | None, int]]:

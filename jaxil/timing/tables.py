@@ -4,9 +4,8 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from flax.traverse_util import flatten_dict
-
 from jaxil.errors import UsageError, printable
+from jaxil.files.settings import as_stored, flat
 from jaxil.files.untrusted import read_regular
 
 # The meaning of each row, by section.
@@ -116,7 +115,7 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """Returns the differences in device, machine and config fields."""
     before, now = (
         {name: each.get(name) for name in _CIRCUMSTANCES if name in old}
-        | flatten_dict({"config": json.loads(json.dumps(each["config"]))}, sep=".")
+        | flat(as_stored({"config": each["config"]}))
         for each in (old, new)
     )
     found = []

@@ -225,11 +225,9 @@ class Checkpoints:
         """Fills the replay with the episodes of a checkpoint that can be read."""
         oldest, added = record["oldest_episode"], record["num_episodes"]
         replay.clear(oldest)
-        # Earlier versions had no list, because they left no episode out.
-        expected = record.get("episodes", list(range(oldest, added)))
-        checksums = record.get("episode_checksums", [None] * len(expected))
-        known = dict(zip(expected, checksums, strict=True))
-        self._checksums = {i: crc for i, crc in known.items() if crc is not None}
+        expected = record["episodes"]
+        known = dict(zip(expected, record["episode_checksums"], strict=True))
+        self._checksums = known.copy()
         faults = []
         for index in range(oldest, added):
             if index not in expected:
@@ -245,15 +243,9 @@ class Checkpoints:
                 f"({'; '.join(faults[:3])}{more}): what follows differs from an "
                 "uninterrupted run"
             )
-        # Checkpoints of earlier versions lack this file, or the number of steps of a
-        # lost episode: the rewards in the episodes' files are used then.
-        if not rewards.exists() or (faults and "episode_steps" not in record):
-            return
-        stored = replay.episodes
-        steps = record.get("episode_steps") or [len(replay.rewards(i)) for i in stored]
-        parts = np.split(np.load(rewards), np.cumsum(steps, dtype=int)[:-1])
-        for index, part in zip(expected, parts):
-            if index in stored:
+        ends = np.cumsum(record["episode_steps"], dtype=int)[:-1]
+        for index, part in zip(expected, np.split(np.load(rewards), ends)):
+            if index in replay.episodes:
                 replay.replace_rewards(index, part)
 
     def _remember(self, path: pathlib.Path, record: dict) -> None:

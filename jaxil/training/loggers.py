@@ -13,7 +13,6 @@ from typing import Any, Protocol
 from jaxil import outside
 from jaxil.config import Config
 from jaxil.errors import Fault, UsageError
-from jaxil.files.tables import CsvLog
 
 _WANDB = "wandb"
 
@@ -82,25 +81,6 @@ def make(
     elif config.logger:
         chosen.append(outside.load(config.logger, "logger"))
     return [each(workdir, config.to_dict(), resume_frame) for each in chosen]
-
-
-class Tables:
-    """A CSV table for each group."""
-
-    def __init__(self, **tables: CsvLog) -> None:
-        self._tables = tables
-
-    def write_scalars(
-        self, group: str, frame: int, values: Mapping[str, float]
-    ) -> None:
-        """Appends a row."""
-        self._tables[group].append({"frame": frame, **values})
-
-    def write_video(self, frame: int, path: pathlib.Path) -> None:
-        """Does nothing."""
-
-    def close(self) -> None:
-        """Does nothing: each row is written at once."""
 
 
 class TensorBoard:

@@ -22,8 +22,8 @@ from jaxil.training.agent import Agent
 from jaxil.training.checkpoint import Checkpoints
 from jaxil.training.evaluator import Evaluator
 from jaxil.training.expert_distance import ExpertDistance
-from jaxil.training.run_log import Outputs
-from jaxil.training.stopwatch import Stopwatch, TimedPool
+from jaxil.training.run_log import RunLog
+from jaxil.training.stopwatch import Stopwatch, TimedEnvironments
 from jaxil.training.updates import Updates
 
 
@@ -86,7 +86,7 @@ class Parts:
     experts: ExpertEpisodes | None
     evaluator: Evaluator
     checkpoints: Checkpoints
-    log: Outputs
+    log: RunLog
     progress: ProgressLine
     stopwatch: Stopwatch
 
@@ -141,7 +141,7 @@ class Parts:
                 environment,
                 first_episode=counters.num_episodes + len(open_episodes),
                 open_episodes=open_episodes,
-                timed=functools.partial(TimedPool, stopwatch=stopwatch),
+                timed=functools.partial(TimedEnvironments, stopwatch=stopwatch),
                 say=say,
             ),
             replay=replay,
@@ -155,7 +155,7 @@ class Parts:
                 distance,
             ),
             checkpoints=checkpoints,
-            log=Outputs(
+            log=RunLog(
                 workdir,
                 config,
                 demonstrations,
@@ -163,7 +163,7 @@ class Parts:
                 owes_evaluation=counters.owes_evaluation,
             ),
             progress=ProgressLine(
-                config.total_frames, first_frame=frame, even_from=config.seed_frames
+                config.total_frames, first_frame=frame, steady_from=config.seed_frames
             ),
             stopwatch=stopwatch,
         )

@@ -53,7 +53,7 @@ EVAL_COLUMNS = (
 _SATURATED = 3.0
 
 
-class Outputs:
+class RunLog:
     """Owns what a run writes beside its checkpoints.
 
     All methods raise RunFolderError if a file cannot be written.
@@ -87,7 +87,7 @@ class Outputs:
         if evaluated is not None and owes_evaluation:
             evaluated -= 1
         with writes_to(workdir):
-            tables = {
+            self._tables = {
                 name: CsvLog(
                     workdir / f"{name}.csv", columns, resume_frame=frame, say=say
                 )
@@ -96,10 +96,7 @@ class Outputs:
                     ("eval", EVAL_COLUMNS, evaluated),
                 )
             }
-            self._loggers: list[loggers.Logger] = [
-                loggers.Tables(**tables),
-                *loggers.make(config, workdir, resume_frame),
-            ]
+            self._loggers = loggers.make(config, workdir, resume_frame)
         self._expert_return: float | None = None
         if demonstrations is not None:
             self._expert_return = demonstrations.mean_return()
@@ -220,6 +217,7 @@ class Outputs:
             self._write_scalars("train", frame, row)
 
     def _write_scalars(self, group: str, frame: int, row: Mapping[str, Any]) -> None:
+        self._tables[group].append({"frame": frame, **row})
         for logger in self._loggers:
             logger.write_scalars(group, frame, row)
 

@@ -25,7 +25,7 @@ class Stopwatch:
         return call
 
 
-class TimedPool:
+class TimedEnvironments:
     """Environments whose calls, waiting included, count as "environment"."""
 
     def __init__(self, pool: Any, stopwatch: Stopwatch) -> None:

@@ -279,7 +279,7 @@ def test_processes_are_started_where_they_pay(pays, alone, monkeypatch):
         yield from ()  # which leaves all to this process
 
     monkeypatch.setattr(rendering, "_render_together", render_together)
-    monkeypatch.setattr(rendering, "_SOFTWARE", ("",))  # every renderer
+    monkeypatch.setattr(rendering, "renders_in_software", lambda gl_name: True)
     monkeypatch.setattr(rendering.os, "sched_getaffinity", lambda _: {0, 1})
     num_pixels = TOTAL * SIZE**2
     monkeypatch.setattr(rendering, "_MIN_PARALLEL_PIXELS", num_pixels + (not pays))

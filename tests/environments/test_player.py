@@ -40,7 +40,7 @@ def play(player, count, rounds=1000):
     """Plays all episodes, or some rounds; returns those that ended."""
     finished = []
     for _ in range(rounds):
-        player.begin(lambda number: number < count)
+        player.begin(lambda: player.next_episode < count)
         if not player.is_playing:
             break
         player.step(policy(player.observations))
@@ -103,7 +103,7 @@ def test_a_player_goes_on_in_the_very_next_round_with_the_same_choices():
     )
     left = []
     for player in (unbroken, resumed):
-        player.begin(lambda _, player=player: left.append(player.steps_left(4)) or True)
+        player.begin(lambda player=player: left.append(player.steps_left(4)) or True)
     assert left == [2, 2]
     np.testing.assert_array_equal(resumed.observations, unbroken.observations)
     assert unbroken.observations.tolist() == [[12.0], [20.0]]
@@ -120,7 +120,7 @@ def test_open_episodes_are_repeated_action_by_action():
     made.step = taped_step
     actions = np.array([[0.25], [-0.5]], np.float32)
     player = Player(made, first_episode=4, open_episodes={0: actions})
-    player.begin(lambda _: True)
+    player.begin(lambda: True)
     assert taken == actions.tolist()
     assert player.observations.tolist() == [[2.0]]
 
@@ -146,7 +146,7 @@ def test_what_is_seen_and_what_ends_come_by_number_not_by_environment():
     seen = []
     ended = []
     for _ in range(3):
-        player.begin(lambda number: number < 3)
+        player.begin(lambda: player.next_episode < 3)
         seen.append(player.observations[:, 0].tolist())
         player.step(policy(player.observations))
         ended.append([int(e.frames[0, 0]) // 10 for e in player.observe()])
@@ -156,7 +156,7 @@ def test_what_is_seen_and_what_ends_come_by_number_not_by_environment():
 
 def test_nothing_begins_that_is_not_wanted():
     player = Player(environments([3], 2), first_episode=0)
-    assert not player.begin(lambda _: False)
+    assert not player.begin(lambda: False)
     assert not player.is_playing
     assert player.steps_left(3) == 0
 
@@ -184,7 +184,7 @@ def test_an_error_of_the_task_in_a_step_says_what_and_where():
 
     environment.step = step
     player = Player(InProcess(environment), first_episode=0)
-    assert player.begin(lambda _: True)
+    assert player.begin(lambda: True)
     player.step(np.zeros((1, 1)))
     with pytest.raises(EnvironmentsFailed) as caught:
         player.observe()

@@ -16,6 +16,7 @@ import dm_env
 import numpy as np
 import pytest
 
+from jaxil.environments import pool as pool_module
 from jaxil.environments.player import InProcess, Player
 from jaxil.environments.pool import Pool
 from jaxil.environments.suite import make_environment
@@ -69,7 +70,7 @@ def play(
     """Plays whole episodes; returns them by number."""
     player, whole = Player(environments, first_episode=0), {}
     for number in range(100):
-        player.begin(lambda episode: episode < num_episodes)
+        player.begin(lambda: player.next_episode < num_episodes)
         if not player.is_playing:
             return whole
         steps = {n: len(actions) for n, actions in player.open_episodes.items()}
@@ -81,8 +82,8 @@ def play(
     raise AssertionError("it goes on and on")
 
 
-def counting_pool(size, say=print, **seconds):
-    return Pool(Counting, size, say=say, **seconds)
+def counting_pool(size, say=print):
+    return Pool(Counting, size, say=say)
 
 
 def assert_counted(episodes):
@@ -143,9 +144,12 @@ def test_several_processes_play_and_none_is_left():
     ("sent", "said"),
     [(signal.SIGKILL, "was killed by SIGKILL"), (signal.SIGSTOP, "not answer for 3 s")],
 )
-def test_a_lost_process_is_replaced_and_its_episode_played_again(sent, said):
+def test_a_lost_process_is_replaced_and_its_episode_played_again(
+    sent, said, monkeypatch
+):
+    monkeypatch.setattr(pool_module, "_STEP_SECONDS", 3.0)
     lines, rounds = [], []
-    pool = counting_pool(2, lines.append, step_seconds=3.0)
+    pool = counting_pool(2, lines.append)
     first_pids = pool.pids
 
     def lose_one(number, steps):

@@ -11,7 +11,6 @@ from dm_control.suite import pendulum
 from dm_env import specs
 
 from jaxil.environments import suite, tasks
-from jaxil.environments.interaction import Environment
 from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.environments.suite import SuiteEnvironment, make_environment
 
@@ -341,9 +340,3 @@ def test_no_gl_is_said_with_a_way_out(monkeypatch):
     environment = small()
     with pytest.raises(RuntimeError, match=r"No OpenGL .*jaxil\.doctor"):
         environment.reset()
-
-
-def test_it_is_all_that_the_loop_needs():
-    environment: Environment = small()
-    assert isinstance(environment, Environment)
-    assert not isinstance(environment.action_spec(), Environment)

@@ -38,18 +38,15 @@ def test_folders_and_long_names_are_replaced_too(tmp_path):
 def test_what_killed_processes_left_is_removed(tmp_path):
     left = [
         ".tmp-0123456789ab-eval.csv",
-        ".frame_000001000.0123456789abcdef.tmp.mp4",
-        ".learning_curve.png.0123456789abcdef.tmp",
-        "config.json.4711.tmp",
-        ".writing_0123.npz",
+        ".tmp-0123456789ab-frame_000001000.mp4",
     ]
     kept = ["config.json", "eval.csv", ".DS_Store", "notes.tmp"]
     for name in (*left, *kept):
         (tmp_path / name).write_text("")
-    (tmp_path / ".saving_0123" / "learner").mkdir(parents=True)
+    (tmp_path / ".deleting_frame_000000001000" / "learner").mkdir(parents=True)
 
     remove_leftovers(tmp_path, min_age_seconds=60.0)
-    assert len(list(tmp_path.iterdir())) == 10  # others may be writing them now
+    assert len(list(tmp_path.iterdir())) == 7  # others may be writing them now
     for path in tmp_path.iterdir():
         before = time.time() - 61
         os.utime(path, (before, before))

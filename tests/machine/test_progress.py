@@ -101,7 +101,7 @@ def test_a_log_file_gets_a_line_every_30_seconds():
 
 def test_frames_before_anything_is_learned_tell_nothing_of_the_time_left():
     stream = io.StringIO()
-    line, clock = make_line(stream, total_frames=10_000, even_from=4_000)
+    line, clock = make_line(stream, total_frames=10_000, steady_from=4_000)
     frame = 0
     for second in range(130):
         clock.seconds = second

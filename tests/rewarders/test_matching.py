@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial import distance
 
 from jaxil.maths import transport
-from jaxil.rewarders.matching import closest_rewards, make_matching
+from jaxil.rewarders.matching import closest, make_matching
 
 
 def matching(cost="euclidean", alignment="time"):
@@ -73,4 +73,4 @@ def test_rows_carry_their_share_and_padding_carries_nothing(alignment):
 
 def test_closest_is_by_cost_not_by_number():
     costs = jnp.array([[[3.0]], [[1.0]], [[2.0]]])
-    np.testing.assert_allclose(closest_rewards(costs, jnp.ones((3, 1, 1))), [-1.0])
+    np.testing.assert_allclose(closest(costs, jnp.ones((3, 1, 1)))[0], [-1.0])

@@ -12,7 +12,7 @@ import scipy.optimize
 from jaxil.maths import stacking, transport
 from jaxil.networks.agent import actor_features
 from jaxil.rewarders import psil
-from jaxil.rewarders.matching import closest_rewards, make_matching
+from jaxil.rewarders.matching import closest, make_matching
 from tests.tiny_agent import (
     NETWORKS,
     SIDE,
@@ -75,7 +75,8 @@ def solve(costs, *, epsilon, num_iterations):
         epsilon=epsilon,
         num_iterations=num_iterations,
     )
-    return closest_rewards(costs, jax.vmap(lambda c: matching.plan(c, *masses))(costs))
+    plans = jax.vmap(lambda c: matching.plan(c, *masses))(costs)
+    return closest(costs, plans)[0]
 
 
 # The transport -----------------------------------------------------------------

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxil.training import learner_files
 from jaxil.training.checkpoint import CheckpointError, Checkpoints
 from tests.training.saved_runs import (
     ABSTRACT,
@@ -101,28 +100,6 @@ def test_replaced_rewards_come_back(tmp_path):
     restored = restore(tmp_path).replay
     for index in (0, 2):
         np.testing.assert_array_equal(restored.rewards(index), replay.rewards(index))
-
-
-@pytest.mark.parametrize("has_rewards", [False, True])
-def test_a_checkpoint_of_an_earlier_version_is_restored(
-    tmp_path, monkeypatch, has_rewards
-):
-    # Without rewards, at first; without a list of episodes and their checksums.
-    replay, write = make_replay(2), learner_files.write
-
-    def write_as_before(folder, state, record, arrays):
-        for name in ("episodes", "episode_steps", "episode_checksums"):
-            del record[name]
-        write(folder, state, record, arrays if has_rewards else {})
-
-    monkeypatch.setattr(learner_files, "write", write_as_before)
-    save(Checkpoints(tmp_path), 1, replay)
-    for index in range(2):
-        arrays: dict = replay.episode(index)._asdict()
-        if has_rewards:
-            arrays["rewards"] = arrays["rewards"] * 0
-        np.savez(tmp_path / "replay" / f"episode_{index:08d}.npz", **arrays)
-    assert_same_replay(replay, restore(tmp_path).replay)
 
 
 def test_other_files_in_the_folders_are_ignored(tmp_path):

@@ -30,7 +30,7 @@ def make_outputs():
     def make(folder, resume_frame=None, logger=""):
         config = jaxil_config.default_config("drqv2", "cartpole_swingup")
         config.logger = logger
-        made.append(run_log.Outputs(folder, config, None, resume_frame))
+        made.append(run_log.RunLog(folder, config, None, resume_frame))
         return made[-1]
 
     yield make

@@ -171,7 +171,7 @@ def test_an_open_folder_is_in_use(tmp_path):
 
 
 def test_leftovers_of_killed_processes_are_removed_at_the_start(tmp_path):
-    left = ["config.json.12.tmp", ".tmp-12-eval.csv", "videos/.frame_1.ab.tmp.mp4"]
+    left = [".tmp-12-eval.csv", "videos/.tmp-12-frame_1.mp4"]
     (tmp_path / "videos").mkdir()
     for name in left:
         (tmp_path / name).write_text("")

@@ -26,7 +26,7 @@ from jaxil.demonstrations.readers.recording import (
     first_bytes,
     read_json,
 )
-from jaxil.files.untrusted import require_regular
+from jaxil.files.untrusted import open_regular
 
 _INFO = "meta/info.json"
 _MAX_EPISODES = 1_000_000
@@ -225,8 +225,7 @@ def _video_frames(
 def _read_table(file: pathlib.Path, names: Sequence[str]) -> Any:
     from pyarrow import parquet
 
-    require_regular(file)
-    with file.open("rb") as opened, parquet.ParquetFile(opened) as content:
+    with open_regular(file) as opened, parquet.ParquetFile(opened) as content:
         missing = [name for name in names if name not in content.schema_arrow.names]
         if missing:
             raise FormatError(f"has no column {', '.join(missing)} in {file.name}")

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxil.errors import printable
-from jaxil.files.untrusted import require_regular
+from jaxil.files.untrusted import open_regular, require_regular
 
 
 class FormatError(ValueError):
@@ -145,8 +145,7 @@ def read_json(path: pathlib.Path, *, max_bytes: int = 64 * 1024**2) -> dict[str,
 def first_bytes(path: pathlib.Path, count: int) -> bytes:
     """Returns the start of a file; b"" if it is not a readable regular file."""
     try:
-        require_regular(path)
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return file.read(count)
-    except (OSError, ValueError):
+    except OSError:
         return b""
