@@ -199,7 +199,9 @@ class Run(Parts):
         rewarder = self.agent.observe(self.state.rewarder, *arguments)
         self.state = self.state.replace(rewarder=rewarder)
         rewards = np.asarray(self.agent.rewards(rewarder, *arguments))
-        self.require_finite({"imitation reward": float(np.sum(rewards))})
+        same = np.array_equal(rewards, episode.rewards, equal_nan=True)
+        name = "the task's reward" if same else "imitation reward"
+        self.require_finite({name: float(np.sum(rewards))})
         return rewards
 
     def refresh_is_due(self) -> bool:
@@ -254,14 +256,11 @@ class Run(Parts):
         counters.last_eval_step = counters.num_steps
         counters.seconds = time.monotonic() - self.started
         line = self.log.evaluation(
-            result.evaluation,
+            result,
             self.frame,
             counters.seconds,
             counters.num_episodes,
             pre_tanh=float(counters.metrics.get("actor/pre_tanh", np.nan)),
-            distance=result.distance,
-            sides=result.sides,
-            filmed=result.filmed,
         )
         self.progress.message(line)
 

@@ -158,6 +158,18 @@ def test_a_reward_that_is_not_finite_stops_the_run_before_it_is_stored():
     assert not dummies.num_stored
 
 
+def test_a_task_is_not_blamed_on_the_imitation():
+    def rewards(rewarder, params, episode, experts):
+        del rewarder, params, experts
+        episode.rewards[:] = np.nan
+        return episode.rewards
+
+    dummies = Dummies()
+    dummies.run.agent.rewards = rewards
+    with pytest.raises(TrainingDiverged, match="the task's reward became"):
+        dummies.loop()
+
+
 def test_an_action_that_is_not_finite_stops_the_run_before_the_task_gets_it():
     dummies = Dummies(exploration_steps=0)
     sample = dummies.run.agent.sample_action

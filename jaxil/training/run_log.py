@@ -3,7 +3,7 @@
 import contextlib
 import io
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,13 +11,13 @@ import numpy as np
 from jaxil import methods
 from jaxil.config import Config
 from jaxil.demonstrations import loading
-from jaxil.environments.evaluation import Evaluation
 from jaxil.errors import MethodError
 from jaxil.files import video
 from jaxil.files.tables import CsvLog
 from jaxil.files.writing import write_atomically
 from jaxil.machine.screen import say
-from jaxil.training import film, learning_curve, loggers
+from jaxil.training import learning_curve, loggers
+from jaxil.training.evaluator import Result
 from jaxil.training.workdir import writes_to
 
 TRAIN_COLUMNS = (
@@ -138,31 +138,26 @@ class RunLog:
 
     def evaluation(
         self,
-        evaluation: Evaluation,
+        result: Result,
         frame: int,
         seconds: float,
         episode: int,
         *,
         pre_tanh: float,
-        distance: float | None,
-        sides: Sequence[film.Side],
-        filmed: Mapping[str, np.ndarray],
     ) -> str:
         """Logs an evaluation, with learning curve and video.
 
         Args:
-          evaluation: what was played.
+          result: what was played, and its video.
           frame: of the run.
           seconds: of the run.
           episode: training episodes so far.
           pre_tanh: the actor's mean |pre-tanh|; NaN before the first update.
-          distance: to the expert, relative to a random policy; None if unknown.
-          sides: of the video; empty without one.
-          filmed: arrays to keep beside the video, see `Evaluator.explain`.
 
         Returns:
           A line for the terminal.
         """
+        evaluation = result.evaluation
         row: dict[str, Any] = {
             "seconds": round(seconds, 3),
             "episode": episode,
@@ -172,8 +167,8 @@ class RunLog:
         }
         if self._expert_return is not None:
             row["expert_task_return_mean"] = self._expert_return
-        if distance is not None:
-            row["wasserstein_to_expert"] = distance
+        if result.distance is not None:
+            row["wasserstein_to_expert"] = result.distance
         config = self._config
         with writes_to(self._workdir):
             self._write_scalars("eval", frame, row)
@@ -183,8 +178,8 @@ class RunLog:
                 title=f"{config.method} on {config.task}, seed {config.seed}",
                 expert_return=self._expert_return,
             )
-            if sides:
-                self._write_video(sides, filmed, frame)
+            if result.sides:
+                self._write_video(result, frame)
         line = (
             f"frame {frame}: task return {evaluation.mean:.1f} ± {evaluation.std:.1f}"
         )
@@ -221,18 +216,13 @@ class RunLog:
         for logger in self._loggers:
             logger.write_scalars(group, frame, row)
 
-    def _write_video(
-        self,
-        sides: Sequence[film.Side],
-        filmed: Mapping[str, np.ndarray],
-        frame: int,
-    ) -> None:
+    def _write_video(self, result: Result, frame: int) -> None:
         folder = self._workdir / "videos"
         folder.mkdir(exist_ok=True)
         packed = io.BytesIO()
-        np.savez_compressed(packed, **filmed)  # pyright: ignore[reportArgumentType]
+        np.savez_compressed(packed, **result.filmed)  # pyright: ignore[reportArgumentType]
         write_atomically(folder / f"frame_{frame:09d}.npz", packed.getvalue())
-        frames, captions = zip(*sides)
+        frames, captions = zip(*result.sides)
         path = folder / f"frame_{frame:09d}.mp4"
         fps = frames_per_second(len(frames[0]))
         video.write_video(path, *frames, fps=fps, labels=captions)

@@ -18,6 +18,7 @@ from jaxil.environments.evaluation import Evaluation
 from jaxil.errors import MethodError, UsageError
 from jaxil.files.tables import CsvLog, read_csv
 from jaxil.training import film, learning_curve, loggers, run_log
+from jaxil.training.evaluator import Result
 from jaxil.training.workdir import RunFolderError
 from tests.commands import call
 from tests.processes import wait_for
@@ -64,16 +65,8 @@ _SIDE = film.Side(np.zeros((2, 24, 24, 3), np.uint8), ["", ""])
 
 def write_evaluation(outputs, frame=1000, sides=()):
     evaluation = Evaluation([], np.array([10.0, 30.0]), [])
-    return outputs.evaluation(
-        evaluation,
-        frame,
-        20.0,
-        1,
-        pre_tanh=4.0,
-        distance=0.5,
-        sides=list(sides),
-        filmed={},
-    )
+    result = Result(evaluation, distance=0.5, sides=list(sides), filmed={})
+    return outputs.evaluation(result, frame, 20.0, 1, pre_tanh=4.0)
 
 
 def test_tables_events_and_curve(make_outputs, tmp_path):
