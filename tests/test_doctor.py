@@ -9,7 +9,7 @@ import pytest
 from jaxil import config as jaxil_config
 from jaxil import doctor
 from jaxil.demonstrations import states
-from jaxil.environments import pixel_environment, suite
+from jaxil.environments import pixel_environment, tasks
 from jaxil.errors import UsageError
 from jaxil.machine import devices, memory, provenance, startup
 
@@ -142,7 +142,7 @@ def test_nothing_renders(monkeypatch, config):
         raise RuntimeError("nothing here can render")
 
     monkeypatch.setenv("MUJOCO_GL", "egl")
-    monkeypatch.setattr(suite, "make_environment", fail)
+    monkeypatch.setattr(tasks, "make_environment", fail)
     finding = one(doctor.rendering(config), "MUJOCO_GL")
     assert (finding.level, "egl" in finding.value) == ("fault", True)
     assert "apt-get install" in finding.advice

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from jaxil.demonstrations import states
-from jaxil.environments.suite import make_environment
+from jaxil.environments.suite import SuiteEnvironment
+from jaxil.environments.tasks import make_environment
 from tests.commands import ROOT
 
 _FOLDER = ROOT / "launch" / "experts"
@@ -63,6 +64,7 @@ def test_acrobot_energy_stays_without_friction_and_torque():
     frictionless = make_environment(
         "acrobot_swingup", seed=0, action_repeat=2, observation="state"
     )
+    assert isinstance(frictionless, SuiteEnvironment)
     frictionless.physics.model.dof_damping[:] = 0
     arm = _arm(frictionless)
     frictionless.close()
@@ -155,6 +157,7 @@ def test_wrong_use_is_one_sentence(script, flags, named, tmp_path, monkeypatch, 
 def cheetah():
     module = importlib.import_module("cheetah_search")
     made = make_environment("cheetah_run", seed=777, observation="state")
+    assert isinstance(made, SuiteEnvironment)
     made.reset(episode=1)
     start = made.simulator_state()
     start["qvel"][0] = 3.0  # m/s: what does not run earns nothing

@@ -43,9 +43,9 @@ def test_the_package_is_imported_without_jax():
 
 
 _OBSERVE = """
-from jaxil.environments import suite
+from jaxil.environments import tasks
 for observation in {!r}:
-    made = suite.make_environment("cartpole_swingup", seed=0, observation=observation)
+    made = tasks.make_environment("cartpole_swingup", seed=0, observation=observation)
     print(made.reset().observation.shape)
 """
 

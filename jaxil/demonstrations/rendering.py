@@ -52,7 +52,7 @@ def observe_episodes(
 ) -> np.ndarray:
     """Observes stored episodes with the agent's own environment.
 
-    Arguments not listed are those of `suite.make_environment`.
+    Arguments not listed are those of `tasks.make_environment`.
 
     Args:
       states: `qpos`, `qvel` and `act`, each of shape [K, N + 1, n].

@@ -178,54 +178,18 @@ class SuiteEnvironment(PixelEnvironment):
         return flat_state(self._simulator.task.get_observation(self.physics))
 
 
-def make_environment(
-    task: str,
-    *,
-    seed: int,
-    action_repeat: int = 2,
-    image_size: int = 84,
-    frame_stack: int = 3,
-    render_quality: str = "paper",
-    observation: str = "pixels",
-    camera: str = "",
-    distraction: str = "none",
-    max_episode_frames: int = 0,
-) -> SuiteEnvironment:
-    """Makes the environment of `task`.
+def make_environment(task: str, **settings: Any) -> SuiteEnvironment:
+    """Makes one of `known_tasks()`; `settings` are all of `tasks.make_environment`.
 
-    Args:
-      task: one of `known_tasks()`.
-      seed: determines, with an episode's number, its initial state. At least 0.
-      action_repeat: environment frames per agent step.
-      image_size: height and width in pixels.
-      frame_stack: images per observation; ignored for states.
-      render_quality: "paper", "fast" or "smooth".
-      observation: "pixels" or "state".
-      camera: its name or index; "" for the one of DrQ-v2.
-      distraction: one of `distraction.STRENGTHS`.
-      max_episode_frames: longest episode; 0 for the task's limit, or 1000 without one.
-
-    Raises:
-      ValueError: one of these is unknown or out of range.
+    They are checked by `check_settings`.
     """
-    settings: dict[str, Any] = {
-        "seed": seed,
-        "action_repeat": action_repeat,
-        "image_size": image_size,
-        "frame_stack": frame_stack,
-        "observation": observation,
-        "render_quality": render_quality,
-        "camera": camera,
-        "distraction": distraction,
-        "max_episode_frames": max_episode_frames,
-    }
-    check_settings(settings)
-    simulator = _suite().load(*split_task(task), task_kwargs={"random": seed})
+    random = {"random": settings["seed"]}
+    simulator = _suite().load(*split_task(task), task_kwargs=random)
     return wrap(simulator, default_camera=camera_of(task), **settings)
 
 
 def check_settings(settings: Mapping[str, Any]) -> None:
-    """Raises ValueError for an argument of `make_environment` out of range."""
+    """Raises ValueError for an argument of `tasks.make_environment` out of range."""
     for name, least in (
         ("seed", 0),
         ("action_repeat", 1),

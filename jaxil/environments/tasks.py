@@ -25,14 +25,6 @@ from jaxil.errors import Fault, UsageError, raised
 
 _GYMNASIUM = "gymnasium:"
 _RECORDED_SIZE, _LARGEST_RECORDED = 84, 160  # larger images would fill the memory
-_DEFAULTS = {
-    "action_repeat": 2,
-    "frame_stack": 3,
-    "observation": "pixels",
-    "render_quality": "paper",
-    "camera": "",
-    "distraction": "none",
-}
 
 
 def is_of_suite(task: str) -> bool:
@@ -70,24 +62,52 @@ def problems(task: str, **settings: Any) -> list[Fault]:
 
 
 def make_environment(
-    task: str, *, seed: int, image_size: int = 84, **settings: Any
+    task: str,
+    *,
+    seed: int,
+    action_repeat: int = 2,
+    image_size: int = 84,
+    frame_stack: int = 3,
+    render_quality: str = "paper",
+    observation: str = "pixels",
+    camera: str = "",
+    distraction: str = "none",
+    max_episode_frames: int = 0,
 ) -> PixelEnvironment:
-    """Makes the environment of `task`; other arguments as for the suite's.
+    """Makes the environment of a task.
 
-    Outside dm_control, `render_quality` has no effect, and `camera` and `distraction`
-    are refused.
+    Args:
+      task: such as "walker_walk", "gymnasium:ID" or "package.module:function".
+      seed: determines, with an episode's number, its initial state. At least 0.
+      action_repeat: environment frames per agent step.
+      image_size: height and width in pixels.
+      frame_stack: images per observation; ignored for states.
+      render_quality: "paper", "fast" or "smooth"; without effect outside dm_control.
+      observation: "pixels" or "state".
+      camera: of dm_control alone: its name or index; "" for the one of DrQ-v2.
+      distraction: "none", or for tasks built like the suite's "easy", "medium" or
+        "hard": how much colours, camera angle and background vary by episode.
+      max_episode_frames: longest episode; 0 for the task's limit, or 1000 without one.
 
     Raises:
       UsageError: there is no such task, a package is missing, or a setting does not
         apply to the task.
       ValueError: a setting is out of range, or the task cannot be used.
     """
-    if is_of_suite(task):
-        return suite.make_environment(
-            task, seed=seed, image_size=image_size, **settings
-        )
-    settings = {**_DEFAULTS, **settings, "seed": seed, "image_size": image_size}
+    settings: dict[str, Any] = {
+        "seed": seed,
+        "action_repeat": action_repeat,
+        "image_size": image_size,
+        "frame_stack": frame_stack,
+        "observation": observation,
+        "render_quality": render_quality,
+        "camera": camera,
+        "distraction": distraction,
+        "max_episode_frames": max_episode_frames,
+    }
     suite.check_settings(settings)
+    if is_of_suite(task):
+        return suite.make_environment(task, **settings)
     if task.startswith(_GYMNASIUM):
         simulator: Any = _Gymnasium(task.removeprefix(_GYMNASIUM), image_size)
     else:
@@ -109,9 +129,9 @@ def _wrapped(simulator: Any, settings: dict[str, Any]) -> PixelEnvironment:
         simulator = _DmControl(simulator, settings["camera"])
         settings["camera"] = ""
     del settings["render_quality"]
-    for name in ("camera", "distraction"):
+    for name, without in (("camera", ""), ("distraction", "none")):
         value = settings.pop(name)
-        if value != _DEFAULTS[name]:
+        if value != without:
             raise UsageError(
                 Fault(name, "is for tasks of dm_control's suite", value=value)
             )

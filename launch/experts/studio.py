@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 from jaxil.command import UsageError
 from jaxil.demonstrations import playing, states
-from jaxil.environments import suite
+from jaxil.environments import tasks
 from jaxil.machine import startup
 
 SEED = 777  # as in `jaxil.collect`
@@ -35,7 +35,7 @@ def record(
             flush=True,
         )
 
-    with suite.make_environment(
+    with tasks.make_environment(
         task, seed=SEED, action_repeat=ACTION_REPEAT, observation="state"
     ) as environment:
         begin = prepare(environment)

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxil.demonstrations import loading, states
 from jaxil.demonstrations.states import StateDemonstrations
-from jaxil.environments.suite import make_environment
+from jaxil.environments.tasks import make_environment
 
 TASK = "finger_turn_hard"  # its target is not part of the simulator's state
 NUM_EPISODES, NUM_STEPS, SIZE = 2, 4, 16

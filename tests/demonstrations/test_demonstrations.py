@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from jaxil.demonstrations import loading, rendering, sampling, states
 from jaxil.demonstrations.states import DemonstrationError
-from jaxil.environments.suite import make_environment
+from jaxil.environments.tasks import make_environment
 from tests.demonstrations.recorded_states import (
     FIRST_EPISODE,
     FRAMES,

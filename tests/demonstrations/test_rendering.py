@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from jaxil.demonstrations import loading, rendering, states
-from jaxil.environments.suite import make_environment
+from jaxil.environments.suite import SuiteEnvironment
+from jaxil.environments.tasks import make_environment
 from tests.commands import ROOT
 from tests.processes import wait_until_gone
 
@@ -28,6 +29,7 @@ REAL_RENDER = rendering._render_episode
 
 def make_states():
     environment = make_environment(TASK, seed=SEED, observation="state")
+    assert isinstance(environment, SuiteEnvironment)
     rng = np.random.default_rng(0)
     widths = {name: len(value) for name, value in environment.simulator_state().items()}
     environment.close()
@@ -298,6 +300,7 @@ def test_the_expert_is_seen_from_the_agents_camera():
         settings["render_quality"] = "fast"
         expert = loading.load(num_episodes=1, action_repeat=frame, **settings)
         with make_environment(seed=0, **settings) as environment:
+            assert isinstance(environment, SuiteEnvironment)
             environment.reset()
             environment.set_simulator_state(**state)
             seen[camera] = environment.single_observation()

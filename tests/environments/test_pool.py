@@ -19,7 +19,7 @@ import pytest
 from jaxil.environments import pool as pool_module
 from jaxil.environments.player import InProcess, Player
 from jaxil.environments.pool import Pool
-from jaxil.environments.suite import make_environment
+from jaxil.environments.tasks import make_environment
 from jaxil.errors import EnvironmentsFailed
 from tests.processes import is_alive, wait_until_gone
 

@@ -10,9 +10,10 @@ from dm_control.rl import control
 from dm_control.suite import pendulum
 from dm_env import specs
 
-from jaxil.environments import suite, tasks
+from jaxil.environments import suite
 from jaxil.environments.pixel_environment import PixelEnvironment
-from jaxil.environments.suite import SuiteEnvironment, make_environment
+from jaxil.environments.suite import SuiteEnvironment
+from jaxil.environments.tasks import make_environment
 
 SIZE = 24
 # Plain, with a moving camera, with a string, with a target drawn at each reset.
@@ -25,6 +26,7 @@ def small(task="cartpole_swingup", **changes) -> SuiteEnvironment:
     environment = make_environment(
         task, **({"seed": 1, "image_size": SIZE, "render_quality": "fast"} | changes)
     )
+    assert isinstance(environment, SuiteEnvironment)
     _made.append(environment)
     return environment
 
@@ -242,8 +244,9 @@ def without_cameras():
 
 def test_a_model_without_cameras_is_seen_by_the_free_one():
     for look in ("none", "hard"):
-        task, settings = f"{__name__}:without_cameras", {"distraction": look}
-        _made.append(tasks.make_environment(task, seed=0, image_size=SIZE, **settings))
+        task = f"{__name__}:without_cameras"
+        made = make_environment(task, seed=0, image_size=SIZE, distraction=look)
+        _made.append(made)
         assert _made[-1].reset(0).observation.std() > 0
 
 
@@ -321,7 +324,7 @@ def test_faults_name_value_and_rule(changes, message):
         small(**changes)
     if "task" not in changes:  # the user's own tasks are checked in the same way
         with pytest.raises(ValueError, match=message):
-            tasks.make_environment(f"{__name__}:Countdown", **({"seed": 1} | changes))
+            make_environment(f"{__name__}:Countdown", **({"seed": 1} | changes))
 
 
 def test_images_may_be_larger_than_the_models_buffer():
