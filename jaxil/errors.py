@@ -83,11 +83,11 @@ class RunFailed(RuntimeError):
 
 
 class EnvironmentsFailed(RunFailed):
-    """A task or policy raised an error in an episode, or a process keeps dying."""
+    """A task or policy raised an error, or a process keeps dying."""
 
 
 class MethodError(RunFailed):
-    """A method breaks its interface."""
+    """A method breaks its interface, or one of the user's own raised an error."""
 
 
 class TrainingDiverged(RunFailed):
@@ -95,20 +95,23 @@ class TrainingDiverged(RunFailed):
 
 
 @contextlib.contextmanager
-def told_as(who: str, what: str) -> Iterator[None]:
-    """Raises EnvironmentsFailed for any error of the user's code in this block.
+def told_as(
+    who: str, what: str, kind: type[RunFailed] = EnvironmentsFailed
+) -> Iterator[None]:
+    """Raises a RunFailed for any error of the user's code in this block.
 
     Args:
-      who: "the task" or "the policy", for the message.
+      who: "the task", "the policy" or a method's name, for the message.
       what: what was being done.
+      kind: what is raised.
     """
     try:
         yield
     except (RunFailed, UsageError):
         raise
-    except Exception as error:
-        words = f"{who} raised an error in {what}: {raised(error)}"
-        raise EnvironmentsFailed(words) from error
+    except (Exception, SystemExit) as error:
+        words = " ".join(raised(error).split())  # jax's take many lines
+        raise kind(f"{who} raised an error in {what}: {words}") from error
 
 
 def raised(error: BaseException) -> str:

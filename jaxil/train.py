@@ -341,6 +341,8 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
             way_out = f"Rerun the same command to {does}"
             raise EnvironmentsFailed(f"{error}\n{newest}. {way_out}") from error
         run.finish()
+    if not (run.stop_asked or run.state.num_updates):
+        screen.say("nothing was learned: lower seed_frames or num_steps")
     ended, way_on = "finished", "a larger --config.total_frames trains on"
     if run.stop_asked:
         ended, way_on = "stopped", "rerun the same command to resume"

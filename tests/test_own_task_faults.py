@@ -3,67 +3,32 @@
 import itertools
 import os
 import pathlib
-from typing import Any
 from unittest import mock
 
-import dm_env
 import numpy as np
 import pytest
 from dm_env import specs
 
-from jaxil import config as jaxil_config
 from jaxil.demonstrations import foreign
 from jaxil.environments import tasks
 from jaxil.environments.pixel_environment import PixelEnvironment
-from jaxil.training import assembly
 from tests.commands import call, small
+from tests.own_task import BLACK, Task, bounded
 
 ROOT = pathlib.Path(__file__).parent.parent
 _NUMBERS = itertools.count()
-_BLACK = np.zeros((8, 8, 3), np.uint8)
-
-
-class Task(dm_env.Environment):
-    """Gives what it is told, and keeps the action that it gets."""
-
-    def __init__(
-        self,
-        bounds: Any = None,
-        image: Any = _BLACK,
-        reward: Any = 0.0,
-        discount: Any = 1.0,
-    ):
-        self._bounds = bounds or specs.BoundedArray((1,), np.float64, -1.0, 1.0)
-        self._image, self._reward, self._discount = image, reward, discount
-        self.taken = np.zeros(0)
-
-    def reset(self):
-        return dm_env.restart(self._image)
-
-    def step(self, action):
-        self.taken = action
-        return dm_env.transition(self._reward, self._image, self._discount)
-
-    def observation_spec(self):
-        return specs.Array(np.shape(self._image), np.asarray(self._image).dtype)
-
-    def action_spec(self):
-        return self._bounds
-
-
-def bounded(low, high, dtype: Any = np.float64):
-    return specs.BoundedArray((2,), dtype, np.array(low), np.array(high))
 
 
 @pytest.mark.parametrize(
     ("faulty", "words"),
     [
+        (lambda: Task(bounded([], [])), "needs a bounded vector"),
         (lambda: Task(reward=None), "reward is None; it must be a number, 0 in"),
         (lambda: Task(reward="much"), "reward is 'much'"),
         (lambda: Task(discount=None), "discount is None; it must lie in [0, 1]"),
         (lambda: Task(discount=1.5), "discount is 1.5"),
         (lambda: Task(image=np.zeros((8, 8))), "it observes float64[8, 8]"),
-        (lambda: Task(image=_BLACK / 2.0), "it observes float64[8, 8, 3]"),
+        (lambda: Task(image=BLACK / 2.0), "it observes float64[8, 8, 3]"),
         (lambda: Task(image={}), "it observes nothing"),
         (lambda: Task(image={"a": [1, [2, 3]], "b": None}), "list, NoneType"),
         (lambda: Task(bounded([-1, 0], [1, np.inf])), "one limit alone"),
@@ -221,8 +186,8 @@ def test_every_environment_is_closed(num_environments, tmp_path, monkeypatch):
     task, events = f"{__name__}:counted", tmp_path / "events"
     monkeypatch.setenv("JAXIL_TEST_COUNTED", str(events))
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    run, trust = tmp_path / "run", f"--trust={task}"
-    train = (f"--config=drqv2:{task}", *small("drqv2"), f"--workdir={run}")
+    run, trust, n = tmp_path / "run", f"--trust={task}", "--config.num_steps=1"
+    train = (f"--config=drqv2:{task}", *small("drqv2"), n, f"--workdir={run}")
     several = f"--config.num_environments={num_environments}"
     output = f"--output={tmp_path / 'expert.npz'}"
     once = ("--repeats=1", "--steps=2", "--nostart")
@@ -294,19 +259,6 @@ def test_episodes_of_unequal_length_are_recorded_as_pixels(monkeypatch, tmp_path
     assert "2 episodes" in ended.stdout
     recording = foreign.open_recording(output, max_bytes=2**24)
     assert [len(episode.frames) for episode in recording.episodes] == [4, 5]
-
-
-def test_an_episode_longer_than_the_replay_is_said(monkeypatch):
-    task = Task()
-    task.step_limit = 5000  # pyright: ignore[reportAttributeAccessIssue]
-    name = f"{__name__}:long"
-    monkeypatch.setitem(globals(), "long", lambda: task)
-    config = jaxil_config.default_config("drqv2", name)
-    config.update(action_repeat=2, total_frames=10_000, replay_size_steps=2_000)
-    (fault,) = assembly.problems(config)
-    assert "less than an episode, which has 2500 agent steps" in str(fault)
-    config.max_episode_frames = 4_000
-    assert assembly.problems(config) == []
 
 
 def test_a_task_that_observes_images_alone_is_timed(monkeypatch):

@@ -3,7 +3,6 @@
 import logging
 import math
 import numbers
-from collections.abc import Mapping
 from typing import Any
 
 import dm_env
@@ -11,6 +10,7 @@ import numpy as np
 from dm_env import specs
 from PIL import Image
 
+from jaxil.environments import observations
 from jaxil.errors import raised
 from jaxil.replay.stacking import gather_stacks
 
@@ -86,7 +86,7 @@ class PixelEnvironment(dm_env.Environment):
                 name="observation",
             )
         else:
-            parts = _states_in(simulator.observation_spec())
+            parts = observations.states_in(simulator.observation_spec())
             state_dim = sum(math.prod(part.shape) for part in parts)
             if state_dim == 0:
                 raise ValueError("observes images alone: set observation to 'pixels'.")
@@ -183,7 +183,7 @@ class PixelEnvironment(dm_env.Environment):
 
         Known after a reset.
         """
-        shapes = [image.shape[:2] for image in _images_in(self._seen)]
+        shapes = [image.shape[:2] for image in observations.images_in(self._seen)]
         is_square = len(shapes) == 1 and shapes[0][0] == shapes[0][1]
         return shapes[0][0] if is_square else None
 
@@ -230,7 +230,7 @@ class PixelEnvironment(dm_env.Environment):
 
     def _observed_image(self) -> np.ndarray | None:
         """Returns the image that the task itself observes; None unless it is one."""
-        images = _images_in(self._seen)
+        images = observations.images_in(self._seen)
         if len(images) != 1:
             return None
         shape, expected = images[0].shape, self._image_shape or images[0].shape
@@ -244,18 +244,23 @@ class PixelEnvironment(dm_env.Environment):
         if render is None:
             raise ValueError(
                 f"neither observes one uint8 [H, W, 3] nor offers render(); it "
-                f"observes {_described(self._seen)}"
+                f"observes {observations.described(self._seen)}"
             )
         scales = getattr(self._simulator, "renders_any_size", False)
         image = np.asarray(render(side) if scales else render())
-        if not _is_image(image):
+        if not observations.is_image(image):
             raise ValueError(
-                f"renders {_described(image)}, but uint8 [H, W, 3] is expected"
+                f"renders {observations.described(image)}, but uint8 [H, W, 3] is "
+                "expected"
             )
         return image
 
     def _state(self) -> np.ndarray:
-        return flat_state(self._seen)
+        state = observations.flat_state(self._seen)
+        (size,) = self._observation_spec.shape
+        if len(state) != size:
+            raise ValueError(f"observes {len(state)} numbers, but its spec says {size}")
+        return state
 
     def _observe(self) -> np.ndarray:
         single = self.single_observation()
@@ -267,15 +272,10 @@ class PixelEnvironment(dm_env.Environment):
         return gather_stacks(np.stack(self._frames), indices)[0]
 
 
-def flat_state(observation: Any) -> np.ndarray:
-    """Returns a task's own observation, without images, as float32 [S]."""
-    flat = [np.ravel(part) for part in _states_in(observation)]
-    return np.concatenate(flat).astype(np.float32)
-
-
 def _action_range(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
     """Returns the smallest and largest actions; -1 and 1 where there are no limits."""
-    if not isinstance(bounds, specs.BoundedArray) or len(bounds.shape) != 1:
+    is_bounded = isinstance(bounds, specs.BoundedArray)
+    if not is_bounded or not len(bounds.shape) == 1 <= bounds.shape[0]:
         raise ValueError(f"has actions {bounds}, but needs a bounded vector")
     low, high = (
         np.broadcast_to(x, bounds.shape).astype(np.float64)
@@ -316,34 +316,3 @@ def _discount(value: Any) -> float:
         rule = "must lie in [0, 1], with 0 at a true end"
         raise ValueError(f"a step's discount is {value!r}; it {rule}")
     return number
-
-
-def _described(observation: Any) -> str:
-    """Returns types and shapes, for messages."""
-    shown = [
-        f"{part.dtype}{list(part.shape)}"
-        if isinstance(part, np.ndarray)
-        else type(part).__name__
-        for part in _parts(observation)
-    ]
-    return ", ".join(shown) or "nothing"
-
-
-def _parts(observation: Any) -> list[Any]:
-    """Returns the arrays, or specs, of an observation."""
-    if not isinstance(observation, Mapping):
-        return [observation]
-    return [part for value in observation.values() for part in _parts(value)]
-
-
-def _is_image(array: Any) -> bool:
-    shape = getattr(array, "shape", ())
-    return len(shape) == 3 and shape[2] == 3 and array.dtype == np.uint8
-
-
-def _images_in(observation: Any) -> list[np.ndarray]:
-    return [part for part in _parts(observation) if _is_image(part)]
-
-
-def _states_in(observation: Any) -> list[Any]:
-    return [part for part in _parts(observation) if not _is_image(part)]

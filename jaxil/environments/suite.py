@@ -15,7 +15,8 @@ import numpy as np
 
 from jaxil.environments.camera import RENDER_QUALITIES, Renderer
 from jaxil.environments.distraction import STRENGTHS, Distraction
-from jaxil.environments.pixel_environment import PixelEnvironment, flat_state
+from jaxil.environments.observations import flat_state
+from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.errors import unknown_name
 from jaxil.machine import startup
 

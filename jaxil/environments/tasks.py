@@ -21,7 +21,7 @@ from dm_env import specs
 from jaxil import outside
 from jaxil.environments import suite
 from jaxil.environments.pixel_environment import PixelEnvironment
-from jaxil.errors import Fault, UsageError, raised
+from jaxil.errors import Fault, UsageError, raised, unknown_name
 
 _GYMNASIUM = "gymnasium:"
 _RECORDED_SIZE, _LARGEST_RECORDED = 84, 160  # larger images would fill the memory
@@ -44,8 +44,11 @@ def problems(task: str, **settings: Any) -> list[Fault]:
       task: one of the suite is only made, and only if a camera has to be looked up.
       settings: those of `make_environment`.
     """
-    if is_of_suite(task) and not settings["camera"]:
-        return []
+    if is_of_suite(task):
+        if task not in suite.known_tasks():
+            return [unknown_name("task", task, suite.known_tasks())]
+        if not settings["camera"]:
+            return []
     try:
         with make_environment(task, seed=0, **settings) as environment:
             if not is_of_suite(task):

@@ -1,13 +1,13 @@
 """What a method returns, checked where it is traced: mistakes of one's own methods."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxil.errors import MethodError
+from jaxil.errors import MethodError, told_as
 from jaxil.learner.rewarder import Rewarder
 from jaxil.maths.types import AnyEpisode, ExpertBatch, Metrics
 
@@ -18,10 +18,10 @@ def checked_rewarder(name: str, rewarder: Rewarder) -> Rewarder:
     Checked are shapes and types, once for each compilation: rewards are [T],
     metrics are scalars, and `observe` and `update` return a state like the one that
     they got. A state that changed would train, and its checkpoint could not be loaded
-    again.
+    again. An error that a user's own method raises becomes a MethodError too.
 
     Args:
-      name: of the method, for the message.
+      name: of the method, for the message; with a colon it is the user's own.
       rewarder: see `Rewarder`.
     """
 
@@ -64,7 +64,19 @@ def checked_rewarder(name: str, rewarder: Rewarder) -> Rewarder:
                 )
         return _like(name, "update", state, found[0]), found[1]
 
-    return rewarder._replace(rewards=rewards, observe=observe, update=update)
+    checked = rewarder._replace(rewards=rewards, observe=observe, update=update)
+    if ":" not in name:
+        return checked
+    hooks = {part: f for part, f in checked._asdict().items() if callable(f)}
+    return checked._replace(**{part: _told(name, part, f) for part, f in hooks.items()})
+
+
+def _told(name: str, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def call(*arguments: Any) -> Any:
+        with told_as(name, f"`{part}`", MethodError):
+            return function(*arguments)
+
+    return call
 
 
 def _like(name: str, function: str, before: Any, after: Any) -> Any:

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxil import train
 from jaxil.config import Config
+from jaxil.errors import told_as
 from jaxil.machine.progress import ProgressLine
 from jaxil.maths.types import Episode
 from jaxil.training import agent as agents
@@ -186,11 +187,12 @@ class Bench:
         num_steps = environment.episode_steps
         rng = np.random.default_rng(self.config.seed)
         actions = rng.uniform(-1, 1, (num_steps, *environment.action_spec().shape))
-        environment.reset(episode=0)
-        frames = [environment.single_observation()]
-        for action in actions[:_RENDERED_FRAMES]:
-            environment.step(action)
-            frames.append(environment.single_observation())
+        with told_as("the task", "an episode of random actions"):
+            environment.reset(episode=0)
+            frames = [environment.single_observation()]
+            for action in actions[:_RENDERED_FRAMES]:
+                environment.step(action)
+                frames.append(environment.single_observation())
         return Episode(
             frames=np.stack([frames[i % len(frames)] for i in range(num_steps + 1)]),
             actions=actions.astype(np.float32),

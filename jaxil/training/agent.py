@@ -13,7 +13,7 @@ from jaxil import methods
 from jaxil.config import Config
 from jaxil.demonstrations import loading
 from jaxil.environments.pixel_environment import PixelEnvironment
-from jaxil.errors import Fault, UsageError
+from jaxil.errors import Fault, MethodError, UsageError, told_as
 from jaxil.learner.averaging import begin_average, make_averaging_step
 from jaxil.learner.checked import checked_rewarder
 from jaxil.learner.gathering import Step, make_gathering_step, make_repeated_step
@@ -192,7 +192,8 @@ def make_rewarder(config: Config, networks: AgentNetworks) -> Rewarder:
         names = ", ".join(fields) or "none"
         way_out = f"give it the agent and, as keywords, the declared fields ({names})"
         raise UsageError(Fault("method", rule, way_out, config.method)) from error
-    rewarder = make(agent, **fields)
+    with told_as(config.method, f"`{method.make_rewarder}`", MethodError):
+        rewarder = make(agent, **fields)
     if not isinstance(rewarder, Rewarder):
         rule = f"{function} returns {type(rewarder).__name__}"
         raise UsageError(Fault("method", rule, "return a Rewarder", config.method))
@@ -247,7 +248,8 @@ def make_agent(
     step = make_update_step(learner)
     if method.make_update_step is not None:
         make_step = methods.load(config.method, method.make_update_step)
-        step = make_step(learner, **_own_fields(config))
+        with told_as(config.method, f"`{method.make_update_step}`", MethodError):
+            step = make_step(learner, **_own_fields(config))
     averages = config.policy_tau < 1.0
     if averages:
         step = make_averaging_step(step, tau=config.policy_tau)

@@ -1,7 +1,7 @@
 """From a checked config to a run's environments, replay and demonstrations."""
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -47,9 +47,9 @@ def problems(config: Config) -> list[Fault]:
     faults += loggers.problems(config.logger)
     bad = {fault.subject.partition(".")[0] for fault in faults}
     if not bad & {"task", *_environment_settings(config)}:
-        found = tasks.problems(config.task, **_environment_settings(config))
-        if not found and "replay_size_steps" not in bad:
-            found = _replay_problems(config)
+        found = task_problems(config)
+        if not found and not bad & {"replay_size_steps", "num_steps"}:
+            found = list(_length_problems(config))
         faults += found
         bad |= {fault.subject for fault in found}
     if config.encoder.convolutions == "native" and "encoder" not in bad:
@@ -75,17 +75,24 @@ def problems(config: Config) -> list[Fault]:
     return faults
 
 
-def _replay_problems(config: Config) -> list[Fault]:
-    """Returns a fault if the replay cannot hold an episode of the task."""
-    if tasks.is_of_suite(config.task):  # episodes of 1000 frames, the smallest replay
-        return []
-    limit = config.max_episode_frames
-    _, steps = tasks.timing(config.task, config.action_repeat, limit)
-    if steps <= config.replay_size_steps:
-        return []
-    rule = f"is less than an episode, which has {steps} agent steps"
-    way_out = f"use {steps} or more, or a smaller max_episode_frames"
-    return [Fault("replay_size_steps", rule, way_out, config.replay_size_steps)]
+def task_problems(config: Config) -> list[Fault]:
+    """Returns every reason why the task cannot be played."""
+    return tasks.problems(config.task, **_environment_settings(config))
+
+
+def _length_problems(config: Config) -> Iterator[Fault]:
+    """Yields faults of an episode's length, which no replay or update may exceed."""
+    size, n = config.replay_size_steps, config.num_steps
+    _, steps = tasks.timing(
+        config.task, config.action_repeat, config.max_episode_frames
+    )
+    if steps > size:
+        rule = f"is less than an episode, which has {steps} agent steps"
+        way_out = f"use {steps} or more, or a smaller max_episode_frames"
+        yield Fault("replay_size_steps", rule, way_out, size)
+    if steps < n:
+        rule = f"is more than an episode, which has {steps} agent steps: nothing learns"
+        yield Fault("num_steps", rule, f"use at most {steps}, or longer episodes", n)
 
 
 def demonstration_fault(config: Config) -> str | None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from flax.errors import FlaxError
 
 from jaxil import config as jaxil_config
 from jaxil import outside
@@ -78,6 +79,12 @@ class Policy:
         actions = np.asarray(self._act(self.params.encoder, self.params.actor, batch))
         return actions[0] if is_single else actions
 
+    def check(self) -> None:
+        """Raises what a call would raise if the parameters do not fit the networks."""
+        shape = (1, *self.observation_shape)
+        one = jax.ShapeDtypeStruct(shape, self.observation_dtype)
+        jax.eval_shape(self._act, self.params.encoder, self.params.actor, one)
+
     def make_environment(self, seed: int = 0) -> PixelEnvironment:
         """Returns the task as the policy was trained on it.
 
@@ -117,9 +124,12 @@ def load(folder: pathlib.Path) -> tuple[Policy, PixelEnvironment]:
     """Returns the policy of a run with an environment for its evaluation.
 
     Raises:
-      UsageError: see `load_policy`, or the task is code that only the folder names.
+      UsageError: see `load_policy`, or the task is code that only the folder names,
+        or cannot be played here.
     """
     policy = _policy(folder, workdir.read_config(folder))
+    if faults := assembly.task_problems(policy.config):
+        raise UsageError(faults)
     return policy, assembly.evaluation_environment(policy.config)
 
 
@@ -140,4 +150,10 @@ def _policy(folder: pathlib.Path, config: Config) -> Policy:
     (action_dim,) = head["output"]["bias"].shape
     networks = agents.make_networks(config, action_dim, 0.5 if mean is None else mean)
     params = jax.tree.map(jax.numpy.asarray, params)
-    return Policy(config, networks, LearnerParams(**params), counters)
+    policy = Policy(config, networks, LearnerParams(**params), counters)
+    try:
+        policy.check()
+    except (FlaxError, TypeError, ValueError) as error:
+        words = f"does not fit the checkpoint ({error}); restore it"
+        raise UsageError(f"{folder / 'config.json'} {words}") from error
+    return policy

@@ -63,6 +63,27 @@ def test_a_state_stays_what_init_made_it(change, named):
         jax.eval_shape(rewarder.update, _STATE, _ANY, _ANY, None, _ANY)
 
 
+@pytest.mark.parametrize(
+    "error", [KeyError("weight"), SystemExit(3), TypeError("two\nlines")]
+)
+@pytest.mark.parametrize("part", ["rewards", "init", "summary", "rewards_changed"])
+def test_an_error_of_ones_own_method_is_one_message(error, part):
+    def fail(*arguments):
+        raise error
+
+    def rewards(state, learner, episode, experts):
+        return jnp.ones(4)
+
+    plain = Rewarder(**{"rewards": rewards, part: fail})
+    own = checked_rewarder("my.module:METHOD", plain)
+    arguments = [_ANY] * (4 if part == "rewards" else 3 if part == "init" else 1)
+    with pytest.raises(MethodError, match=f"error in `{part}`: .*test_checked") as said:
+        getattr(own, part)(*arguments)
+    assert "\n" not in str(said.value)
+    with pytest.raises(type(error)):  # of jaxil's own methods it is a fault of jaxil's
+        getattr(checked_rewarder("mine", plain), part)(*arguments)
+
+
 def test_what_keeps_the_interface_passes_unchanged():
     rewarder = _rewarder(
         observe=lambda state, *_: {"count": state["count"] + 1},
