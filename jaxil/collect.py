@@ -26,7 +26,6 @@ import contextlib
 import functools
 import pathlib
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -35,6 +34,7 @@ from absl import flags
 from jaxil import command
 from jaxil.config import FIELDS
 from jaxil.errors import Fault, UsageError, told_as, unknown_name
+from jaxil.files.writing import obstacle
 
 _NUM_EVAL_EPISODES = 10
 _SEED = 777  # of the recording environment; no training or evaluation uses it
@@ -288,20 +288,14 @@ def _output_faults(values: flags.FlagValues) -> list[str]:
     if values.output is None:
         return [] if values.inspect else ["--output=NAME.npz is missing"]
     output = pathlib.Path(values.output)
-    if values.inspect:
-        is_free = output.is_dir() or not output.exists()
-        return [] if is_free else [f"--output={output} must be a folder"]
-    if output.is_dir():
+    if values.inspect and output.exists() and not output.is_dir():
+        return [f"--output={output} must be a folder"]
+    if output.is_dir() and not values.inspect:
         return [f"--output={output} is a folder: name a file, NAME.npz"]
     if values.convert and output.resolve() == pathlib.Path(values.convert).resolve():
         return [f"--output={output} is the file to convert: name another one"]
-    folder = next(parent for parent in output.absolute().parents if parent.exists())
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            return []
-    except OSError as error:
-        reason = error.strerror or error
-        return [f"--output={output} cannot be written ({reason}): name another file"]
+    why = obstacle(output if values.inspect else output.parent)
+    return [f"--output={output} cannot be written ({why}): name another"] if why else []
 
 
 def _named_output(argv: list[str]) -> list[str]:

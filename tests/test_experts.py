@@ -131,7 +131,7 @@ def test_acrobot_record_is_what_its_actions_do(environment, tmp_path, monkeypatc
     ("script", "flags", "named"),
     [
         ("acrobot.py", ("--output=FOLDER/a.npz", "--num_episodes=0"), "num_episodes"),
-        ("acrobot.py", ("--output=FOLDER/missing/a.npz",), "missing"),
+        ("acrobot.py", ("--output=/proc/missing/a.npz",), "/proc: "),
         ("acrobot.py", ("--output=FOLDER",), "is a folder"),
         ("cheetah.py", ("--output=FOLDER/a.npz",), "--workdir"),
         ("cheetah.py", ("--output=FOLDER/a.npz", "--workdir=FOLDER/none"), "none"),

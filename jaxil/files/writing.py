@@ -5,11 +5,28 @@ import os
 import pathlib
 import re
 import shutil
+import tempfile
 import time
 import uuid
 from collections.abc import Iterator
 
 _TEMPORARY = re.compile(r"\.tmp-.*|\.deleting_.*")
+
+
+def obstacle(folder: str | os.PathLike) -> str | None:
+    """Returns why nothing can be written in a folder, which need not exist; else None.
+
+    Tried with a file without a name: permissions alone do not tell a full or read-only
+    disk.
+    """
+    path = pathlib.Path(folder).absolute()
+    # Not pathlib's `exists`, which raises in folders that it may not search.
+    nearest = next(each for each in (path, *path.parents) if os.path.exists(each))
+    try:
+        with tempfile.TemporaryFile(dir=nearest):
+            return None
+    except OSError as error:
+        return f"{nearest}: {error.strerror or error}"
 
 
 @contextlib.contextmanager

@@ -7,6 +7,8 @@ import shutil
 import uuid
 from collections.abc import Iterator
 
+from jaxil.files.writing import obstacle
+
 # This line marks index.html as a report, so that only reports are replaced.
 MARK = '<meta name="generator" content="jaxil.report">'
 _MARK_WITHIN = 2000  # characters
@@ -20,12 +22,8 @@ def problems(output: pathlib.Path) -> list[str]:
     try:
         if real.exists() and not real.is_dir():
             return [f"{name} is a file; name a new folder, such as --output=report"]
-        parent = real.parent
-        while not parent.exists():
-            parent = parent.parent
-        if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
-            rule = f"cannot be written: {parent} must be a folder that you may write"
-            return [f"{name} {rule}"]
+        if why := obstacle(real.parent):
+            return [f"{name} cannot be written ({why}); name another folder"]
         stranger = _stranger(real) if real.is_dir() else None
     except OSError as error:
         return [f"{name} cannot be read ({error.strerror}); name another folder"]

@@ -72,19 +72,9 @@ def problems(workdir: pathlib.Path, config: Config) -> list[Fault]:
       workdir: need not exist; it is not created.
       config: must match the run that is already in the folder, if there is one.
     """
-    parent = workdir
-    # Not pathlib's, which raises in folders that it may not search.
-    while not os.path.exists(parent):
-        parent = parent.parent
-    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
-        return [
-            Fault(
-                "workdir",
-                f"is not writable: {parent} must be a folder that you may write to",
-                "choose another with --workdir=DIR",
-                str(workdir),
-            )
-        ]
+    if why := writing.obstacle(workdir):
+        way_out = "choose another with --workdir=DIR"
+        return [Fault("workdir", f"is not writable ({why})", way_out, str(workdir))]
     if not os.path.exists(workdir / "config.json"):
         return []
     try:

@@ -3,7 +3,6 @@
 import argparse
 import pathlib
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from typing import Any, NoReturn
@@ -11,6 +10,7 @@ from typing import Any, NoReturn
 from jaxil.command import UsageError
 from jaxil.demonstrations import playing, states
 from jaxil.environments import tasks
+from jaxil.files.writing import obstacle
 from jaxil.machine import startup
 
 SEED = 777  # as in `jaxil.collect`
@@ -94,14 +94,9 @@ def _file(text: str) -> pathlib.Path:
     path = pathlib.Path(text)
     if path.is_dir():
         raise argparse.ArgumentTypeError(f"{path} is a folder: name a file, NAME.npz")
-    try:
-        # Before minutes of work are lost.
-        with tempfile.TemporaryFile(dir=path.parent):
-            return path
-    except OSError as error:
-        raise argparse.ArgumentTypeError(
-            f"{path} cannot be written ({error.strerror or error})"
-        ) from error
+    if why := obstacle(path.parent):  # before minutes of work are lost
+        raise argparse.ArgumentTypeError(f"{path} cannot be written ({why})")
+    return path
 
 
 def _count(text: str) -> int:

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from jaxil.files.writing import remove_leftovers, replacing, write_atomically
+from jaxil.files.writing import obstacle, remove_leftovers, replacing, write_atomically
 
 
 def test_a_failed_replacement_leaves_the_old_file(tmp_path, monkeypatch):
@@ -33,6 +33,19 @@ def test_folders_and_long_names_are_replaced_too(tmp_path):
         assert temporary.suffix == ".mp4"
         temporary.write_bytes(b"video")
     assert long.read_bytes() == b"video"
+
+
+@pytest.mark.parametrize("inside", ["", "a", "a/b"])
+def test_a_folder_that_need_not_exist_can_be_written(inside, tmp_path):
+    assert obstacle(tmp_path / inside) is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_in_the_way_of_a_folder_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    for inside in ("file", "file/a"):
+        assert obstacle(tmp_path / inside) == f"{tmp_path}/file: Not a directory"
+    assert str(obstacle("/proc/a/b")).startswith("/proc: ")
 
 
 def test_what_killed_processes_left_is_removed(tmp_path):
