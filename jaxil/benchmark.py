@@ -27,7 +27,7 @@ _EXAMPLE = "such as --sweep=batch_size:64,128,256"
 
 def main(argv: list[str]) -> None:
     """Runs the command."""
-    values = command.parse(argv, __doc__ or "", _define)
+    values = command.parse(argv, __doc__ or "", _define, _flag_problems)
     environment = dict(os.environ)  # before `prepare` changes it
     from jaxil.machine import startup
 
@@ -35,8 +35,7 @@ def main(argv: list[str]) -> None:
     from jaxil.timing import measurement, tables
     from jaxil.training import assembly
 
-    faults = assembly.problems(values.config) + _flag_problems(values)
-    if faults:
+    if faults := assembly.problems(values.config):
         raise UsageError(faults)
     settings: Any = {name: values[name].value for name in ("repeats", "steps", "full")}
     if values.sweep is not None:

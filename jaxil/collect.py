@@ -33,32 +33,45 @@ from absl import flags
 
 from jaxil import command
 from jaxil.config import FIELDS
-from jaxil.errors import Fault, UsageError, told_as, unknown_name
+from jaxil.errors import Fault, UsageError, unknown_name
 from jaxil.files.writing import obstacle
 
 _NUM_EVAL_EPISODES = 10
 _SEED = 777  # of the recording environment; no training or evaluation uses it
 _INSPECTED_SIZE, _CONVERTED_SIZE = 160, 84  # of images rendered from states
-_JOBS = ("workdirs", "policy", "inspect", "convert")
+# What each job reads; all but --inspect need an output.
+_JOBS = {
+    "workdirs": ("trust", "num_episodes"),
+    "policy": ("trust", "num_episodes", "task", "action_repeat", "image_size"),
+    "inspect": ("image_size", "render_quality", "camera", "frame_skip"),
+    "convert": ("image_size", "render_quality", "camera", "frame_skip", "fit"),
+}
 
 
 def main(argv: list[str]) -> None:
     """Runs the command."""
-    values = command.parse(_named_output(argv), __doc__ or "", _define)
-    jobs = [name for name in _JOBS if values[name].value]
-    faults = []
-    if len(jobs) != 1:
-        names = ", ".join(f"--{name}" for name in _JOBS)
-        given = ", ".join(f"--{name}" for name in jobs) or "none"
-        faults.append(f"exactly one of {names} is required; given: {given}")
-    faults += _output_faults(values)
-    if faults:
-        raise UsageError(faults)
+    values = command.parse(_named_output(argv), __doc__ or "", _define, _problems)
     from jaxil.machine import startup
 
     print(startup.prepare(), file=sys.stderr, flush=True)
     functions = (_record, _record_policy, _inspect, _convert)
-    functions[_JOBS.index(jobs[0])](values)
+    for job, function in zip(_JOBS, functions, strict=True):
+        if values[job].value:
+            function(values)
+
+
+def _problems(values: flags.FlagValues) -> list[str]:
+    """Returns faults of the flags together, some of which would show after minutes."""
+    jobs = [name for name in _JOBS if values[name].value]
+    if len(jobs) != 1:
+        names = ", ".join(f"--{name}" for name in _JOBS)
+        given = ", ".join(f"--{name}" for name in jobs) or "none"
+        faults = [f"exactly one of {names} is required; given: {given}"]
+        return faults + _output_faults(values)
+    read = (*jobs, "output", *_JOBS[jobs[0]])
+    unread = [name for name in values if values[name].present and name not in read]
+    faults = [f"--{name} is not for --{jobs[0]}: leave it out" for name in unread]
+    return faults + _output_faults(values)
 
 
 def _record(values: flags.FlagValues) -> None:
@@ -139,60 +152,25 @@ def _write(
     action_repeat: int,
     expert: str,
 ) -> None:
-    """Plays and writes episodes: simulator states if possible, else pixels."""
+    """Records episodes and prints what they return."""
     import numpy as np
 
-    from jaxil.demonstrations import playing, states
-    from jaxil.demonstrations.readers import own
-    from jaxil.demonstrations.readers.recording import Recording
-    from jaxil.environments.interaction import Restorable
+    from jaxil.demonstrations import from_policy, states
     from jaxil.machine import screen
 
-    def decide(step: int, observation: Any) -> Any:
-        with told_as("the policy", f"step {step}"):
-            action = np.asarray(act(observation), np.float32)
-        if not np.all(np.abs(action) <= 1.0):  # nor NaN
-            raise ValueError(f"returned {action} at step {step}, not in [-1, 1].")
-        return action
-
-    output, returns = pathlib.Path(values.output), []
-    seconds = environment.step_seconds
-    play: dict[str, Any] = {
-        "environment": environment,
-        "begin": lambda episode: decide,
-        "num_episodes": values.num_episodes,
-        "finished": lambda episode, task_return: returns.append(task_return),
-    }
+    output = pathlib.Path(values.output)
     try:
-        arrays = None
-        try:
-            if isinstance(environment, Restorable):
-                arrays = playing.play(**play)
-        except playing.LengthsDiffer as error:
-            screen.say(f"{error}, so pixels are recorded, not states")
-            returns.clear()
-        if arrays is not None:
-            metadata = states.new_metadata(
-                task=task,
-                action_repeat=action_repeat,
-                seed=_SEED,
-                first_episode=0,
-                expert=expert,
-                rewards=arrays["rewards"],
-            )
-            states.write_states(
-                output, states.StateDemonstrations(**arrays, metadata=metadata)
-            )
-        else:
-            recording = Recording(
-                "jaxil pixels",
-                values.num_episodes,
-                playing.play_pixels(**play),
-                task=task,
-                action_repeat=action_repeat,
-                frames_per_second=seconds and 1.0 / seconds,
-            )
-            own.write_pixels(output, recording, origin=f"recorded, {expert}")
+        returns = from_policy.record(
+            output,
+            environment,
+            act,
+            num_episodes=values.num_episodes,
+            task=task,
+            action_repeat=action_repeat,
+            seed=_SEED,
+            expert=expert,
+            say=screen.say,
+        )
     except (OSError, states.DemonstrationError) as error:
         raise UsageError(f"--output={output}: {error}") from error
     print(

@@ -17,7 +17,7 @@ import ml_collections
 from absl import flags
 
 from jaxil import config as jaxil_config
-from jaxil import methods, outside, presets
+from jaxil import declarations, methods, outside, presets
 from jaxil.config import Config
 from jaxil.errors import Fault, RunFailed, UsageError, raised, unknown_name
 from jaxil.files.settings import flat
@@ -26,12 +26,6 @@ Define = Callable[[flags.FlagValues], None]
 Check = Callable[[flags.FlagValues], Iterable[Fault | str]]
 
 _CONFIG, _TRUST = "config", "trust"
-_KINDS = {
-    bool: "True or False",
-    int: "a whole number",
-    float: "a number",
-    tuple: "a list in brackets, such as (32,32)",
-}
 
 
 def parse(
@@ -317,7 +311,7 @@ def _override(config: Config, field: str, text: str) -> Iterable[Fault]:
     try:
         target[leaf] = _parsed(text, target[leaf])
     except (ValueError, SyntaxError, TypeError):  # the last of "{{}}"
-        expected = _KINDS[type(target[leaf])]
+        expected = declarations.KINDS[type(target[leaf])]
         return [Fault(field, f"has the wrong type: expected {expected}", value=text)]
     return []
 

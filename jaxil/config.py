@@ -253,6 +253,9 @@ def problems(config: Config, known_tasks: tuple[str, ...]) -> list[Fault]:
       config: as `default_config` makes it, with changes.
       known_tasks: of the control suite; those of other kinds are not checked here.
     """
+    for name in ("method", "task"):  # a ConfigDict takes None for any type
+        if not isinstance(config[name], str):
+            return [Fault(name, "must be a name", value=config[name])]
     try:
         known = fields(config.method)
     except UsageError as error:
@@ -308,7 +311,8 @@ def _problems(
             "set it to False",
             True,
         )
-    yield from _encoder_problems(config)
+    if not any(name.startswith("encoder.") for name in bad):
+        yield from _encoder_problems(config)
 
 
 def _encoder_problems(config: Config) -> Iterator[Fault]:

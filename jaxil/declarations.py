@@ -8,7 +8,14 @@ from typing import Any, NamedTuple
 from jaxil.errors import Fault, unknown_name
 
 # The types of fields that --config.FIELD=TEXT can be read as.
-_TYPES = (bool, int, float, str, tuple)
+# What a field's default may be, and what users call it.
+KINDS = {
+    bool: "True or False",
+    int: "a whole number",
+    float: "a number",
+    str: "text",
+    tuple: "a list in brackets, such as (32,32)",
+}
 # Columns of train.csv that the learner writes begin so, or contain no slash.
 _LEARNER_GROUPS = ("critic/", "actor/", "batch/", "replay/")
 
@@ -112,8 +119,11 @@ def problems(method: Method) -> Iterator[str]:
 
 
 def field_problems(name: str, field: Field, value: Any) -> Iterator[Fault]:
-    """Yields why a field cannot have a value: its choices or its range."""
-    if field.choices:
+    """Yields why a field cannot have a value: its type, its choices or its range."""
+    kind = type(field.default)
+    if not _has_type(value, kind):
+        yield Fault(name, f"must be {KINDS[kind]}", field.about, value)
+    elif field.choices:
         if value not in field.choices:
             yield unknown_name(name, value, field.choices)
     elif field.low is not None or field.high is not None:
@@ -123,6 +133,13 @@ def field_problems(name: str, field: Field, value: Any) -> Iterator[Fault]:
         if not inside or (field.positive and value == low):
             interval = f"{'(' if field.positive else '['}{low}, {high}]"
             yield Fault(name, f"must lie in {interval}", field.about, value)
+
+
+def _has_type(value: Any, kind: type) -> bool:
+    """Returns whether a value can stand where a default of that type does."""
+    if kind is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, list if kind is tuple else kind) or type(value) is kind
 
 
 def _plain_problems(method: Method) -> Iterator[str]:
@@ -178,7 +195,7 @@ def _section_problems(sections: Any) -> Iterator[str]:
                     "become one keyword; rename one"
                 )
             owners[name] = section
-            if type(field.default) not in _TYPES:
+            if type(field.default) not in KINDS:
                 yield (
                     f"has {section}.{name} with the default {field.default!r}; give "
                     "True or False, a number, text or a tuple"

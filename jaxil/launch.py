@@ -17,7 +17,7 @@ def main(argv: list[str]) -> int:
     from jaxil.machine import screen, startup
     from jaxil.training import workdir
 
-    values = command.parse(argv, __doc__ or "", _define, workdir.flag_problems)
+    values = command.parse(argv, __doc__ or "", _define, workdir.output_problems)
     folder = workdir.from_flag(values.workdir)
     # Before jax and MuJoCo are imported, which the imports below do.
     screen.say(startup.prepare())

@@ -25,27 +25,30 @@ _FLAGS = ("output", "seeds", "videos", "watch", "runs", "trust")  # all take a v
 
 def main(argv: list[str]) -> None:
     """Runs the command."""
-    values = command.parse(_named_runs(argv), __doc__ or "", _define)
-    from jaxil.reporting import folder
-
-    output = pathlib.Path(values.output)
-    roots = [pathlib.Path(name) for name in dict.fromkeys(values.runs)]
-    faults = [
-        f"there is no folder {str(root)!r}" for root in roots if not root.is_dir()
-    ]
-    if not roots:
-        faults.append("name the folders of runs: jaxil report RUNS...")
-    if not values.output:
-        faults.append("--output is empty: name a new folder")
-    else:
-        faults += folder.problems(output)
-    if faults:
-        raise UsageError(faults)
+    values = command.parse(_named_runs(argv), __doc__ or "", _define, _problems)
+    output, roots = pathlib.Path(values.output), _roots(values)
     _write(roots, output, values)
     with contextlib.suppress(KeyboardInterrupt):
         while values.watch:
             time.sleep(values.watch)
             _write(roots, output, values)
+
+
+def _roots(values: flags.FlagValues) -> list[pathlib.Path]:
+    return [pathlib.Path(name) for name in dict.fromkeys(values.runs)]
+
+
+def _problems(values: flags.FlagValues) -> list[str]:
+    from jaxil.reporting import folder
+
+    roots = _roots(values)
+    missing = [root for root in roots if not root.is_dir()]
+    faults = [f"there is no folder {str(root)!r}" for root in missing]
+    if not roots:
+        faults.append("name the folders of runs: jaxil report RUNS...")
+    if not values.output:
+        return [*faults, "--output is empty: name a new folder"]
+    return faults + folder.problems(pathlib.Path(values.output))
 
 
 def _write(

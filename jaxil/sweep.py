@@ -40,16 +40,17 @@ def main(argv: list[str]) -> int:
     words = command.joined(argv[1:])
     overrides = [word for word in words if word.lstrip("-").startswith("config.")]
     rest = [word for word in words if word not in overrides]
-    values = command.parse([argv[0], *rest], __doc__ or "", _define)
-    cluster = clusters.Cluster(
-        name=values.cluster,
-        num_workers=values.workers,
-        hours=values.hours,
-        partition=values.partition,
-        num_gpus=values.gpus,
-        num_cpus=values.cpus,
-    )
-    runs = _checked_runs(values, cluster, overrides)
+    runs: list[Run] = []
+
+    def check(values: flags.FlagValues) -> Sequence[Fault | str]:
+        try:
+            runs.extend(_checked_runs(values, _cluster(values), overrides))
+        except UsageError as error:
+            return error.faults
+        return ()
+
+    values = command.parse([argv[0], *rest], __doc__ or "", _define, check)
+    cluster = _cluster(values)
     if values.watch:
         statuses = tables.watch(lambda: _look(runs))
         tables.print_failures(statuses)
@@ -84,6 +85,17 @@ def main(argv: list[str]) -> int:
         print(f"{len(todo)} submitted; see them with the same command and --watch")
         return 0
     return _stay(cluster, statuses, values.workdir)
+
+
+def _cluster(values: flags.FlagValues) -> clusters.Cluster:
+    return clusters.Cluster(
+        name=values.cluster,
+        num_workers=values.workers,
+        hours=values.hours,
+        partition=values.partition,
+        num_gpus=values.gpus,
+        num_cpus=values.cpus,
+    )
 
 
 def _stay(cluster: clusters.Cluster, statuses: Statuses, folder: str) -> int:

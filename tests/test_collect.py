@@ -165,6 +165,11 @@ def test_pixels_keep_their_size_unless_another_is_asked_for(tmp_path):
         (["--inspect=setup.cfg", "--output=setup.cfg"], "must be a folder"),
         (["--convert=setup.cfg", "--output=x.npz"], "in an unsupported format"),
         (["--convert", "a", "b", "c"], "'c' is not a flag"),
+        (
+            ["--convert=a", "--output=b", "--action_repeat=3"],
+            "--action_repeat is not fo",
+        ),
+        (["--inspect=setup.cfg", "--fit=pad"], "--fit is not for --inspect"),
         (["--inspect=a", "--image_size=2"], "image_size"),
         (["--inspect=a", "--render_quality=good"], "render_quality"),
     ],

@@ -47,6 +47,30 @@ def test_a_run_without_an_update_says_so(monkeypatch, tmp_path):
     assert "nothing was learned" in ended.stderr
 
 
+@pytest.mark.parametrize("function", ["reset", "step"])
+def test_what_gymnasium_would_return_is_named(function, monkeypatch):
+    class Tuples(Task):
+        pass
+
+    setattr(Tuples, function, lambda *_: (np.zeros((8, 8, 3), np.uint8), {}))
+    monkeypatch.setitem(globals(), "tuples", Tuples)
+    config = jaxil_config.default_config("drqv2", f"{__name__}:tuples")
+    (fault,) = assembly.problems(config)
+    assert f"{function}() returned tuple; it must return a dm_env.TimeStep" in str(
+        fault
+    )
+
+
+@pytest.mark.parametrize(("policy", "said"), [("three", "shape (3,); the task takes")])
+def test_an_action_of_another_shape_is_the_policys(policy, said, monkeypatch, tmp_path):
+    monkeypatch.setitem(globals(), "short", lambda: Task())
+    monkeypatch.setitem(globals(), policy, lambda observation: np.zeros(3))
+    names = (f"--policy={__name__}:{policy}", f"--task={__name__}:short")
+    ended = call("collect", *names, f"--output={tmp_path}/a.npz", "--num_episodes=1")
+    assert ended.returncode == 2
+    assert said in ended.stderr
+
+
 def test_a_state_is_as_long_as_its_spec_says(monkeypatch):
     class Longer(Task):
         def observation_spec(self):

@@ -9,6 +9,7 @@ import sys
 
 import pytest
 
+from jaxil.files import locking
 from jaxil.files.tables import read_csv
 from jaxil.sweeps import clusters, state, tables
 from jaxil.sweeps.clusters import Cluster
@@ -103,6 +104,17 @@ def test_a_run_that_someone_else_does_is_waited_for(tmp_path):
         assert state.status(run).state is State.RUNNING
         assert _start([run], tmp_path).wait(_SECONDS) == 0
     _check_rows(run, processes=1)
+
+
+def test_a_run_is_done_when_its_process_has_ended(tmp_path):
+    """It writes a last checkpoint, then a video; until then it is no finished run."""
+    run = _quick(tmp_path, "one")
+    assert _start([run], tmp_path).wait(_SECONDS) == 0
+    with locking.locked(run.folder / "lock"):
+        sweep = _start([run], tmp_path)
+        with pytest.raises(subprocess.TimeoutExpired):
+            sweep.wait(5.0)
+    assert sweep.wait(_SECONDS) == 0
 
 
 def test_a_run_that_has_heard_a_signal_is_not_ended_by_its_worker(tmp_path):

@@ -42,6 +42,13 @@ _BAD_VALUES = (
     ("updates_per_dispatch", 0, ("must lie in [1, 1000]",)),
     ("num_environments", 65, ("must lie in [1, 64]",)),
     ("compute_dtype", "float16", ("choose one of: float32",)),
+    # A ConfigDict takes None for any type.
+    ("seed", None, ("seed=None must be a whole number",)),
+    ("learning_rate", None, ("learning_rate=None must be a number",)),
+    ("encoder.channels", None, ("encoder.channels=None must be a list",)),
+    ("demonstrations.source", None, ("demonstrations.source=None must be text",)),
+    ("task", None, ("task=None must be a name",)),
+    ("logger", None, ("logger=None must be text",)),
 )
 
 
@@ -70,7 +77,7 @@ def test_all_faults_come_in_one_message_without_a_traceback(tmp_path):
     finished = call(
         "launch",
         "--config=configs/pdac.py:walker_wlak",
-        f"--workdir={tmp_path}/file/run",
+        "--workdir=/proc/run",
         "--config.batch_size=-3",
         "--config.bath_size=3",
         "--config.learning_rate=fast",
@@ -78,7 +85,32 @@ def test_all_faults_come_in_one_message_without_a_traceback(tmp_path):
     )
     assert finished.returncode == 2
     assert "Traceback" not in finished.stderr
-    for word in ("walker_walk", "batch_size=-3", "bath_size", "'fast'", "--bogus"):
+    named = (
+        "walker_walk",
+        "batch_size=-3",
+        "bath_size",
+        "'fast'",
+        "--bogus",
+        "/proc/run",
+    )
+    for word in named:
+        assert word in finished.stderr
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (["sweep", "--methods=pdcc", "--workdir=/proc/run"], ["pdcc", "/proc/run"]),
+        (["report", "no_run", "--output=/proc/x"], ["no_run", "/proc/x"]),
+        (["collect", "--convert=a", "--task=b"], ["--output", "--task is not for"]),
+        (["benchmark", "--json=/proc/x", "--config=pdac:a"], ["--json", "task='a'"]),
+    ],
+)
+def test_a_wrong_flag_hides_no_other_fault(flags, named):
+    command_name, *words = flags
+    finished = call(command_name, *words, "--bogus=1")
+    assert finished.returncode == 2
+    for word in ("--bogus", *named):
         assert word in finished.stderr
 
 

@@ -15,7 +15,7 @@ from jaxil.errors import printable
 
 _NUM_COLUMNS = 8  # images of an episode on the contact sheet, at most
 _NUM_ROWS = 10  # episodes on the contact sheet
-_MIN_SIDE = 96  # pixels of an image on the contact sheet
+_MIN_SIDE, _MAX_SIDE = 96, 1024  # pixels of an image on the contact sheet
 _COMPARED = (16, 16)  # pixels, at which frames are compared
 _MARGIN = 4
 _CAPTION = 16
@@ -206,7 +206,7 @@ def table(inspection: Inspection) -> str:
 def contact_sheet(inspection: Inspection) -> Image.Image:
     """Returns one row of images per episode, in order of time, with their numbers."""
     height, width = inspection.pictures[0][0].frame.shape[:2]
-    scale = _MIN_SIDE / min(height, width)
+    scale = min(_MIN_SIDE / min(height, width), _MAX_SIDE / max(height, width))
     cell = (max(1, round(width * scale)), max(1, round(height * scale)))
     column_width, row_height = cell[0] + _MARGIN, cell[1] + _CAPTION + _MARGIN
     size = (

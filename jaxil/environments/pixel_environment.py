@@ -104,7 +104,8 @@ class PixelEnvironment(dm_env.Environment):
         if episode < 0:
             raise ValueError(f"episode={episode} must not be negative.")
         seeds = np.random.SeedSequence([self._seed, episode])
-        self._seen = self._restart(seeds.generate_state(8)).observation
+        begun = _timestep("reset", self._restart(seeds.generate_state(8)))
+        self._seen = begun.observation
         self._next_episode = episode + 1
         self._reset_next_step, self._frames_played = False, 0
         self._current, self._frames = None, []
@@ -129,7 +130,7 @@ class PixelEnvironment(dm_env.Environment):
         control = control.astype(self._action_dtype)
         reward, discount, is_last = 0.0, 1.0, False
         for _ in range(self._action_repeat):
-            inner = self._simulator.step(control)
+            inner = _timestep("step", self._simulator.step(control))
             self._seen = inner.observation
             reward += _reward(inner.reward)
             discount *= _discount(inner.discount)
@@ -287,6 +288,15 @@ def _action_range(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
     if np.any(below != above):
         raise ValueError(f"has actions with one limit alone: {bounds}; give both")
     return np.where(below, low, -1.0), np.where(below, high, 1.0)
+
+
+def _timestep(function: str, value: Any) -> Any:
+    """Returns what `reset` or `step` returned, if it is like dm_env's; else raises."""
+    parts = ("observation", "reward", "discount", "last")
+    if all(hasattr(value, part) for part in parts):
+        return value
+    what = f"{function}() returned {type(value).__name__}"
+    raise ValueError(f"{what}; it must return a dm_env.TimeStep")
 
 
 def _reward(value: Any) -> float:

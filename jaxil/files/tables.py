@@ -22,6 +22,7 @@ class CsvLog:
         columns: Iterable[str],
         *,
         resume_frame: int | None = None,
+        kept_from: float = math.inf,
         say: Callable[[str], None] = print,
     ):
         """Starts a new file, or with `resume_frame` continues the old one.
@@ -32,19 +33,31 @@ class CsvLog:
             dropped, and new ones are empty in old rows.
           resume_frame: rows after this frame are dropped, as is an incomplete last
             line.
-          say: receives a message if the old file is damaged, which is then renamed.
+          kept_from: a new file does not replace an old one that has this frame or a
+            later one; the old one is renamed.
+          say: receives a message if an old file, damaged or not, is renamed.
         """
         self._path = pathlib.Path(path)
         self._columns = tuple(columns)
         rows: list[dict[str, str]] = []
-        if resume_frame is not None and self._path.exists():
+        if self._path.exists():
+            name = self._path.name
             try:
                 rows = _read(self._path)[1]
-                rows = [row for row in rows if float(row["frame"]) <= resume_frame]
+                frames = [float(row["frame"]) for row in rows]
+                if resume_frame is None:
+                    rows = []
+                    if max(frames, default=0) >= kept_from:
+                        aside = _set_aside(self._path, "old")
+                        say(f"no checkpoint: the former {name} is kept as {aside.name}")
+                else:
+                    rows = [
+                        r for r, frame in zip(rows, frames) if frame <= resume_frame
+                    ]
             except (ValueError, OSError) as error:
-                aside = _set_aside(self._path)
+                aside = _set_aside(self._path, "damaged")
                 rows = []
-                say(f"{error}; kept as {aside.name}, {self._path.name} starts empty")
+                say(f"{error}; kept as {aside.name}, {name} starts empty")
         header = dict(zip(self._columns, self._columns))
         writing.write_atomically(self._path, self._format([header, *rows]))
 
@@ -106,12 +119,12 @@ def _read(path: pathlib.Path) -> tuple[list[str], list[dict[str, str]]]:
     return columns, table
 
 
-def _set_aside(path: pathlib.Path) -> pathlib.Path:
-    """Renames a file to PATH.damaged, or to PATH.damaged2, ..."""
-    aside, again = path.with_name(f"{path.name}.damaged"), 1
+def _set_aside(path: pathlib.Path, word: str) -> pathlib.Path:
+    """Renames a file to PATH.WORD, or to PATH.WORD2, ..."""
+    aside, again = path.with_name(f"{path.name}.{word}"), 1
     while aside.exists():
         again += 1
-        aside = path.with_name(f"{path.name}.damaged{again}")
+        aside = path.with_name(f"{path.name}.{word}{again}")
     return path.rename(aside)
 
 

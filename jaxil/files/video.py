@@ -10,6 +10,7 @@ import numpy as np
 from jaxil.files import writing
 
 _MIN_HEIGHT = 256  # pixels; smaller frames are enlarged by an integer factor
+_MAX_WIDTH = 2048  # of enlarged frames
 _GAP = 8  # pixels between the two images
 _CAPTION = 22  # pixels of the strip above them
 _TEXT = (235, 235, 235)
@@ -45,9 +46,10 @@ def write_video(
     images = _images(frames_left, frames_right, labels)
     first = next(images)
     options = {"movflags": "+faststart"}  # browsers play it while it loads
-    with writing.replacing(path) as temporary, temporary.open("wb") as file:
+    with writing.replacing(path) as temporary:
         try:
-            with av.open(file, "w", "mp4", options=options) as container:
+            # FFmpeg opens the file: a Python file would hide why it cannot be written.
+            with av.open(str(temporary), "w", "mp4", options=options) as container:
                 stream = container.add_stream(
                     "libx264",
                     Fraction(fps).limit_denominator(60_000),
@@ -59,7 +61,8 @@ def write_video(
                     container.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
                 container.mux(stream.encode())
         except av.error.FFmpegError as error:
-            raise OSError(f"the video could not be encoded: {error}") from error
+            words = f"the video could not be encoded: {error.strerror}"
+            raise OSError(words) from error
 
 
 def write_gif(
@@ -111,7 +114,10 @@ def _images(
         if not len(frames) or frames.shape[1:] != frames_left.shape[1:]:
             expected = f"at least one frame of {frames_left.shape[1:]}"
             raise ValueError(f"{name}.shape = {frames.shape}: expected {expected}")
-    factor = max(1, -(-_MIN_HEIGHT // frames_left.shape[1]))
+    enlarged = min(
+        -(-_MIN_HEIGHT // frames_left.shape[1]), _MAX_WIDTH // frames_left.shape[2]
+    )
+    factor = max(1, enlarged)
     height, width = (side * factor for side in frames_left.shape[1:3])
     total_height = _CAPTION + height
     total_width = width * len(sides) + _GAP * (len(sides) - 1)

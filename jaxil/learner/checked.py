@@ -56,19 +56,36 @@ def checked_rewarder(name: str, rewarder: Rewarder) -> Rewarder:
             raise MethodError(
                 f"{name}: `update` returned {what}; expected (state, metrics by name)"
             )
-        for metric, value in found[1].items():
-            if shape := jnp.shape(value):
-                raise MethodError(
-                    f"{name}: `update` returned the metric {metric!r} of shape {shape};"
-                    " expected a scalar"
-                )
+        _require_scalars(name, "update", found[1])
         return _like(name, "update", state, found[0]), found[1]
 
-    checked = rewarder._replace(rewards=rewards, observe=observe, update=update)
+    def summary(state: Any) -> Metrics:
+        found = rewarder.summary(state)
+        if not isinstance(found, Mapping):
+            what = type(found).__name__
+            raise MethodError(
+                f"{name}: `summary` returned {what}; expected scalars by name"
+            )
+        _require_scalars(name, "summary", found)
+        return found
+
+    checked = rewarder._replace(
+        rewards=rewards, observe=observe, update=update, summary=summary
+    )
     if ":" not in name:
         return checked
     hooks = {part: f for part, f in checked._asdict().items() if callable(f)}
     return checked._replace(**{part: _told(name, part, f) for part, f in hooks.items()})
+
+
+def _require_scalars(name: str, function: str, metrics: Mapping[str, Any]) -> None:
+    for metric, value in metrics.items():
+        if value is None or jnp.shape(value):
+            what = "None" if value is None else f"shape {jnp.shape(value)}"
+            raise MethodError(
+                f"{name}: `{function}` returned the metric {metric!r} of {what}; "
+                "expected a scalar"
+            )
 
 
 def _told(name: str, part: str, function: Callable[..., Any]) -> Callable[..., Any]:

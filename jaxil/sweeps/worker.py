@@ -82,8 +82,10 @@ class Worker:
 
     def _do(self, run: Run) -> bool:
         """Trains a run; returns False if another process has it and may abandon it."""
-        if state.is_finished(run) or state.damage(run):
+        if state.damage(run):
             return True
+        if state.is_finished(run):  # its process may not have ended yet
+            return not state.is_in_use(run)
         try:
             run.folder.mkdir(parents=True, exist_ok=True)
             with locking.locked(run.folder / "claim"):
@@ -118,7 +120,7 @@ class Worker:
             exit_status = self._wait(process)
         killed = (-signal.SIGHUP, -signal.SIGTERM, -signal.SIGINT, -signal.SIGKILL)
         was_stopped = self.must_stop and exit_status in killed
-        if exit_status in (0, _STOPPED_STATUS) or was_stopped:
+        if exit_status in (0, _STOPPED_STATUS) or was_stopped or state.is_finished(run):
             return True
         if exit_status == _WRONG_USE_STATUS and locking.is_locked(run.folder / "lock"):
             return False  # someone has started it by hand at the same time

@@ -44,7 +44,8 @@ def problems(config: Config) -> list[Fault]:
     Reads the demonstration file, but renders nothing.
     """
     faults = jaxil_config.problems(config, known_tasks())
-    faults += loggers.problems(config.logger)
+    if isinstance(config.logger, str):
+        faults += loggers.problems(config.logger)
     bad = {fault.subject.partition(".")[0] for fault in faults}
     if not bad & {"task", *_environment_settings(config)}:
         found = task_problems(config)

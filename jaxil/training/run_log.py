@@ -89,7 +89,12 @@ class RunLog:
         with writes_to(workdir):
             self._tables = {
                 name: CsvLog(
-                    workdir / f"{name}.csv", columns, resume_frame=frame, say=say
+                    workdir / f"{name}.csv",
+                    columns,
+                    resume_frame=frame,
+                    # A checkpoint had been saved by then, and was deleted since.
+                    kept_from=config.checkpoint_every_frames,
+                    say=say,
                 )
                 for name, columns, frame in (
                     ("train", (*TRAIN_COLUMNS, *own), resume_frame),

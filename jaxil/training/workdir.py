@@ -65,6 +65,19 @@ def from_flag(value: str | None) -> pathlib.Path:
     return path
 
 
+def output_problems(values: Any) -> Sequence[Fault | str]:
+    """Returns why no run can be written to the folder of the flag `--workdir`."""
+    found = flag_problems(values)
+    return found or _place_problems(pathlib.Path(values.workdir))
+
+
+def _place_problems(workdir: pathlib.Path) -> list[Fault]:
+    if why := writing.obstacle(workdir):
+        way_out = "choose another with --workdir=DIR"
+        return [Fault("workdir", f"is not writable ({why})", way_out, str(workdir))]
+    return []
+
+
 def problems(workdir: pathlib.Path, config: Config) -> list[Fault]:
     """Returns every reason why a run cannot use a folder.
 
@@ -72,11 +85,14 @@ def problems(workdir: pathlib.Path, config: Config) -> list[Fault]:
       workdir: need not exist; it is not created.
       config: must match the run that is already in the folder, if there is one.
     """
-    if why := writing.obstacle(workdir):
-        way_out = "choose another with --workdir=DIR"
-        return [Fault("workdir", f"is not writable ({why})", way_out, str(workdir))]
+    if faults := _place_problems(workdir):
+        return faults
     if not os.path.exists(workdir / "config.json"):
-        return []
+        if newest_checkpoint(workdir) is None:
+            return []
+        rule = "has checkpoints but no config.json, which says whose they are"
+        way_out = "restore it, or choose another with --workdir=DIR"
+        return [Fault("workdir", rule, way_out, str(workdir))]
     try:
         before = read_config(workdir)
     except UsageError as error:
@@ -156,7 +172,10 @@ def writes_to(workdir: pathlib.Path) -> Iterator[None]:
 
 def newest_checkpoint(workdir: pathlib.Path) -> int | None:
     """Returns the environment frame of the newest checkpoint in a folder, or None."""
-    names = [path.name for path in (workdir / "checkpoints").glob("frame_*")]
+    try:
+        names = os.listdir(workdir / "checkpoints")
+    except OSError:
+        return None
     matches = [match for name in names if (match := CHECKPOINT.fullmatch(name))]
     return max((int(match[1]) for match in matches), default=None)
 

@@ -63,12 +63,42 @@ def test_pictures_are_read_in_the_order_of_their_numbers(tmp_path):
     for index, frame in enumerate(FRAMES):
         Image.fromarray(frame).save(tmp_path / f"frame{index}.png")
     (tmp_path / "notes.txt").write_text("about them")
-    _, (episode,) = read_here(pictures, tmp_path)
+    recording, (episode,) = read_here(pictures, tmp_path)
+    assert recording.notes == ("1 other files, notes.txt first, are ignored.",)
     np.testing.assert_array_equal(episode.frames, FRAMES)
     deep = Image.fromarray(GRAY[0].astype(np.uint16) * 257)
     deep.save(tmp_path / "frame0.png")
     _, (episode,) = read_here(pictures, tmp_path)
     np.testing.assert_array_equal(episode.frames[0], GRAY[0][..., None].repeat(3, 2))
+
+
+@pytest.mark.parametrize(
+    ("add", "message"),
+    [
+        (lambda folder: (folder / "3.png").write_text(""), "3.png, which is no PNG"),
+        (
+            lambda folder: (folder / "3.JPG").symlink_to("gone"),
+            "3.JPG, which is no PNG",
+        ),
+        (
+            lambda folder: Image.fromarray(FRAMES[0, :4]).save(folder / "3.png"),
+            "has pictures of 8x8 and 8x4 pixels",
+        ),
+        (
+            lambda folder: (
+                (folder / "episode").mkdir(),
+                Image.fromarray(FRAMES[0]).save(folder / "episode" / "0.png"),
+            ),
+            "pictures beside episode, a folder of them",
+        ),
+    ],
+)
+def test_no_picture_is_left_out_silently(add, message, tmp_path):
+    for index in range(3):
+        Image.fromarray(FRAMES[index]).save(tmp_path / f"{index}.png")
+    add(tmp_path)
+    with pytest.raises(FormatError, match=message):
+        read_here(pictures, tmp_path)
 
 
 def test_shapes_become_squares_in_three_ways():

@@ -64,6 +64,18 @@ def test_without_a_frame_to_resume_from_the_table_begins_anew(tmp_path):
     np.testing.assert_array_equal(read_csv(tmp_path / "log.csv")["frame"], [5])
 
 
+def test_a_long_table_without_a_checkpoint_is_kept(tmp_path):
+    """Someone has deleted the checkpoints of hours of training."""
+    said = []
+    for _ in range(2):
+        write_rows(tmp_path / "log.csv", [10, 20], kept_from=15, say=said.append)
+    assert said == ["no checkpoint: the former log.csv is kept as log.csv.old"]
+    np.testing.assert_array_equal(read_csv(tmp_path / "log.csv.old")["frame"], [10, 20])
+    write_rows(tmp_path / "log.csv", [10], kept_from=25, say=said.append)
+    assert len(said) == 1
+    assert len(list(tmp_path.iterdir())) == 2
+
+
 def test_columns_may_change_between_versions(tmp_path):
     path = tmp_path / "log.csv"
     write_rows(path, [10])

@@ -84,6 +84,19 @@ def test_an_error_of_ones_own_method_is_one_message(error, part):
         getattr(checked_rewarder("mine", plain), part)(*arguments)
 
 
+@pytest.mark.parametrize(
+    ("found", "named"),
+    [
+        (None, "returned NoneType; expected scalars by name"),
+        ({"mine/a": None}, "'mine/a' of None"),
+        ({"mine/a": np.zeros(2)}, r"'mine/a' of shape \(2,\)"),
+    ],
+)
+def test_a_summary_is_of_scalars(found, named):
+    with pytest.raises(MethodError, match=named):
+        _rewarder(summary=lambda state: found).summary(_STATE)
+
+
 def test_what_keeps_the_interface_passes_unchanged():
     rewarder = _rewarder(
         observe=lambda state, *_: {"count": state["count"] + 1},

@@ -54,6 +54,12 @@ def test_demonstrations_may_move_but_not_change(tmp_path):
     assert "demonstrations.source: its content has changed" in str(fault)
 
 
+def test_checkpoints_without_their_config_are_nobodys(tmp_path):
+    (tmp_path / "checkpoints" / "frame_000000002000").mkdir(parents=True)
+    (fault,) = workdir.problems(tmp_path, jaxil_config.default_config("pdac"))
+    assert "has checkpoints but no config.json" in str(fault)
+
+
 def test_a_former_field_is_left_out(tmp_path):
     config = jaxil_config.default_config("psil", "walker_walk")
     old = config.to_dict()

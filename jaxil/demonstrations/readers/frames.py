@@ -59,10 +59,10 @@ def as_rgb(image: np.ndarray) -> np.ndarray:
         image = image.astype(np.uint8) * np.uint8(255)
     elif image.dtype.kind == "f":
         if not (np.min(image) >= 0.0 and np.max(image) <= 1.0):
-            raise FormatError("has images of real numbers outside [0, 1]")
+            raise FormatError("has images of real numbers outside [0, 1]; save uint8")
         image = np.rint(image * 255.0).astype(np.uint8)
     if image.dtype != np.uint8:
-        raise FormatError(f"has images of type {image.dtype}")
+        raise FormatError(f"has images of type {image.dtype}; save uint8")
     return image[..., [0, 0, 0]] if image.shape[-1] == 1 else image[..., :3]
 
 

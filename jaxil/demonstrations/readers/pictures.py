@@ -30,6 +30,7 @@ from jaxil.demonstrations.readers.recording import (
 
 _NPY = b"\x93NUMPY"
 _PICTURES = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")
+_SUFFIXES = (".png", ".jpg", ".jpeg")
 _MAX_PIXELS = 100e6  # of one picture
 _FRAMES_PER_HEARTBEAT = 30
 
@@ -46,7 +47,10 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
     """Reads episodes, scaling each frame as soon as it is read."""
     episodes = _episodes(path)
     is_array = _starts(episodes[0][0], _NPY)
-    yield Recording("NumPy images" if is_array else "pictures", len(episodes))
+    used = {file for files in episodes for file in files}
+    notes = _ignored(path, used) if path.is_dir() else ()
+    kind = "NumPy images" if is_array else "pictures"
+    yield Recording(kind, len(episodes), notes=notes)
     for files in episodes:
         frames, stored, size = [], (0, 0), (0, 0)
         with naming(files[0] if is_array else files[0].parent, path):
@@ -56,6 +60,11 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
                 if not frames:
                     stored = frame.shape[:2]
                     size = wanted_size(stored, options)
+                if frame.shape[:2] != stored:
+                    (height, width), (first, second) = frame.shape[:2], stored
+                    raise FormatError(
+                        f"has pictures of {second}x{first} and {width}x{height} pixels"
+                    )
                 frames.append(resized(frame, size, options.fit))
                 name = f"{len(frames)} or more frames of {size[1]}x{size[0]} pixels,"
                 num_bytes = len(frames) * frames[0].nbytes
@@ -77,6 +86,27 @@ def _episodes(path: pathlib.Path) -> list[list[pathlib.Path]]:
     folders = [_visible(folder) for folder in files if folder.is_dir()]
     found = [[x for x in inside if _starts(x, *_PICTURES)] for inside in folders]
     return [pictures for pictures in found if pictures]
+
+
+def _ignored(path: pathlib.Path, used: set[pathlib.Path]) -> tuple[str, ...]:
+    """Returns a note of the files in a folder, and in those of episodes, not `used`.
+
+    Raises:
+      FormatError: one of them has a picture's name or is an episode, so it was meant.
+    """
+    folders = {path, *(file.parent for file in used)}
+    others = [x for each in sorted(folders) for x in _visible(each) if x not in used]
+    others = [x for x in others if x not in folders]
+    for file in others:
+        if file.suffix.lower() in _SUFFIXES:
+            raise FormatError(f"holds {file.name}, which is no PNG or JPEG picture")
+        if file.is_dir() and any(_starts(x, *_PICTURES) for x in _visible(file)):
+            raise FormatError(
+                f"holds pictures beside {file.name}, a folder of them; keep one kind"
+            )
+    if not others:
+        return ()
+    return (f"{len(others)} other files, {others[0].name} first, are ignored.",)
 
 
 def _visible(folder: pathlib.Path) -> list[pathlib.Path]:
