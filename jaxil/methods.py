@@ -187,10 +187,7 @@ def _say_once(text: str) -> None:
 @functools.cache
 def _declaration(reference: str) -> Method:
     module, _, name = reference.partition(":")
-    try:
-        spec = importlib.util.find_spec(module)
-    except (Exception, SystemExit):  # it imports the packages around the module
-        spec = None
+    spec = outside.spec_of(module)
     if spec is None or not spec.origin or not spec.origin.endswith(".py"):
         raise UsageError(
             Fault(

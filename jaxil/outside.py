@@ -6,6 +6,7 @@ config, or with `--trust`.
 """
 
 import importlib
+import importlib.machinery
 import importlib.util
 from collections.abc import Mapping
 from typing import Any
@@ -51,10 +52,15 @@ def trust(reference: str) -> None:
 def is_found(reference: str) -> bool:
     """Returns whether a reference names a module that Python finds, and a name."""
     module, colon, name = reference.removeprefix("gymnasium:").partition(":")
+    return bool(colon and name) and spec_of(module) is not None
+
+
+def spec_of(module: str) -> importlib.machinery.ModuleSpec | None:
+    """Returns where Python would import a module from; None if it finds none."""
     try:
-        return bool(colon and name) and importlib.util.find_spec(module) is not None
+        return importlib.util.find_spec(module)
     except (Exception, SystemExit):  # it imports the packages around the module
-        return False
+        return None
 
 
 def is_trusted(reference: str) -> bool:

@@ -44,9 +44,10 @@ _READERS: tuple[Any, ...] = (
 # Safe without a child process: parsed in Python, and checked before unpacking.
 _IN_PROCESS = (own, replays)
 FORMATS = (
-    "jaxil states or pixels (.npz), ROT or PatchAIL pickles, folders of DrQ-v2 or "
-    "V-D4RL episodes (.npz, .hdf5), videos (mp4, mov, gif, webm, mkv, avi), folders of "
-    "PNG or JPEG frames, NumPy images (.npy), Minari datasets, LeRobot v3 datasets"
+    "jaxil states or pixels (.npz as jaxil writes it), ROT or PatchAIL pickles, "
+    "folders of DrQ-v2 or V-D4RL episodes (.npz, .hdf5), videos (mp4, mov, gif, webm, "
+    "mkv, avi), folders of PNG or JPEG frames, NumPy images (.npy), Minari datasets, "
+    "LeRobot v3 datasets"
 )
 
 

@@ -15,7 +15,7 @@ from jaxil.environments import tasks
 from jaxil.environments.interaction import Restorable
 from jaxil.files import archive
 
-_WAY_OUT = "Replace it; `jaxil collect --inspect=FILE` shows what a file holds"
+_WAY_OUT = "`jaxil collect --inspect=FILE` shows what a file holds"
 
 
 class Demonstrations(NamedTuple):
@@ -107,16 +107,16 @@ def check(
         raise fault(path, f"{what}, but {task} needs {needed}", way_out)
 
 
-def returns(source: str | os.PathLike = "", **wanted: Any) -> list[float]:
-    """Returns each episode's task return without rendering; empty if unknown.
+def mean_return(source: str | os.PathLike = "", **wanted: Any) -> float | None:
+    """Returns the mean task return without rendering; None if unknown.
 
     For the arguments and errors see `load`.
     """
     request = _request(wanted)
     path = _path_of(source, request.task)
     if states.recognises(path):
-        return _returns(_rewards(*_open_states(path, request)))
-    return _load_pixels(path, request).metadata["returns"]
+        return float(np.mean(_returns(_rewards(*_open_states(path, request)))))
+    return _load_pixels(path, request).mean_return()
 
 
 def load(

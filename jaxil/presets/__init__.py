@@ -5,11 +5,11 @@
 `configs/` hold the same presets as files.
 """
 
-import importlib.util
+import importlib
 import pkgutil
 
 from jaxil import config as jaxil_config
-from jaxil import methods
+from jaxil import methods, outside
 from jaxil.config import Config
 from jaxil.errors import UsageError, unknown_name
 
@@ -38,14 +38,7 @@ def get_config(name: str, argument: str | None = None) -> Config:
         return module.get_config(*([] if argument is None else [argument]))
     if name in methods.known():
         return jaxil_config.default_config(name, argument or _DEFAULT_TASK)
-    if argument and _is_module(name):
+    if argument and outside.spec_of(name) is not None:
         method, _, task = argument.partition(":")
         return jaxil_config.default_config(f"{name}:{method}", task or _DEFAULT_TASK)
     raise UsageError(unknown_name("--config", name, names()))
-
-
-def _is_module(name: str) -> bool:
-    try:
-        return importlib.util.find_spec(name) is not None
-    except (Exception, SystemExit):  # it imports the packages around the module
-        return False

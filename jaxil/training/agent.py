@@ -155,7 +155,7 @@ def native_fault(config: Config) -> str | None:
     return None
 
 
-def mean_image(
+def subtracted_mean(
     config: Config,
     demonstrations: loading.Demonstrations | None,
 ) -> Any:
@@ -221,7 +221,7 @@ def make_agent(
       demonstrations: what the method imitates, or None.
     """
     action_dim = environment.action_spec().shape[0]
-    mean = mean_image(config, demonstrations)
+    mean = subtracted_mean(config, demonstrations)
     networks = make_networks(config, action_dim, mean)
     rewarder = make_rewarder(config, networks)
     learner = Learner(

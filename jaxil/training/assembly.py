@@ -246,9 +246,7 @@ def expert_return(config: Config) -> float | None:
     Raises:
       DemonstrationError: the file does not fit this run.
     """
-    source = config.demonstrations.source
-    found = loading.returns(source, **_file_settings(config))
-    return float(np.mean(found)) if found else None
+    return loading.mean_return(config.demonstrations.source, **_file_settings(config))
 
 
 def _file_settings(config: Config) -> dict[str, Any]:
