@@ -89,7 +89,7 @@ def test_pictures_are_read_in_the_order_of_their_numbers(tmp_path):
                 (folder / "episode").mkdir(),
                 Image.fromarray(FRAMES[0]).save(folder / "episode" / "0.png"),
             ),
-            "pictures beside episode, a folder of them",
+            "frames beside episode, a folder of pictures",
         ),
     ],
 )
@@ -99,6 +99,14 @@ def test_no_picture_is_left_out_silently(add, message, tmp_path):
     add(tmp_path)
     with pytest.raises(FormatError, match=message):
         read_here(pictures, tmp_path)
+
+
+def test_a_preview_beside_an_array_is_ignored(tmp_path):
+    np.save(tmp_path / "images.npy", FRAMES)
+    Image.fromarray(FRAMES[0]).save(tmp_path / "preview.png")
+    recording, (episode,) = read_here(pictures, tmp_path)
+    assert recording.notes == ("1 other files, preview.png first, are ignored.",)
+    np.testing.assert_array_equal(episode.frames, FRAMES)
 
 
 def test_shapes_become_squares_in_three_ways():

@@ -98,12 +98,11 @@ def _ignored(path: pathlib.Path, used: set[pathlib.Path]) -> tuple[str, ...]:
     others = [x for each in sorted(folders) for x in _visible(each) if x not in used]
     others = [x for x in others if x not in folders]
     for file in others:
-        if file.suffix.lower() in _SUFFIXES:
+        if file.suffix.lower() in _SUFFIXES and not _starts(file, *_PICTURES):
             raise FormatError(f"holds {file.name}, which is no PNG or JPEG picture")
         if file.is_dir() and any(_starts(x, *_PICTURES) for x in _visible(file)):
-            raise FormatError(
-                f"holds pictures beside {file.name}, a folder of them; keep one kind"
-            )
+            what = f"holds frames beside {file.name}, a folder of pictures"
+            raise FormatError(f"{what}; keep one kind")
     if not others:
         return ()
     return (f"{len(others)} other files, {others[0].name} first, are ignored.",)
