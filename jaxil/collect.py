@@ -33,7 +33,7 @@ from absl import flags
 
 from jaxil import command
 from jaxil.config import FIELDS
-from jaxil.errors import Fault, UsageError, unknown_name
+from jaxil.errors import UsageError, unknown_name
 from jaxil.files.writing import obstacle
 
 _NUM_EVAL_EPISODES = 10
@@ -71,6 +71,8 @@ def _problems(values: flags.FlagValues) -> list[str]:
     read = (*jobs, "output", *_JOBS[jobs[0]])
     unread = [name for name in values if values[name].present and name not in read]
     faults = [f"--{name} is not for --{jobs[0]}: leave it out" for name in unread]
+    if values.policy and not values.task:
+        faults.append("--task is missing: name the policy's task")
     return faults + _output_faults(values)
 
 
@@ -117,8 +119,6 @@ def _record_policy(values: flags.FlagValues) -> None:
     from jaxil.environments import suite, tasks
 
     known = suite.known_tasks()
-    if not values.task:
-        raise UsageError(Fault("--task", "is missing", "name the policy's task"))
     if tasks.is_of_suite(values.task) and values.task not in known:
         raise UsageError(unknown_name("--task", values.task, known))
     act = outside.load(values.policy, "--policy")
@@ -304,7 +304,7 @@ def _define(values: flags.FlagValues) -> None:
     text("inspect", help="file or folder of any format, or task, to show")
     text("convert", help="file or folder to convert to pixels; also --convert IN OUT")
     text("output", help="NAME.npz; for --inspect a folder for contact sheet and video")
-    number("num_episodes", 50, "episodes to record", 1, 10_000)
+    number("num_episodes", 50, "for --workdirs, --policy: episodes", 1, 10_000)
     image_size = "of images; without it videos shrink to 84 or 160, pixels keep theirs"
     number("image_size", None, image_size, 8, 1024)
     choices = functools.partial(flags.DEFINE_enum, flag_values=values)

@@ -253,9 +253,8 @@ def problems(config: Config, known_tasks: tuple[str, ...]) -> list[Fault]:
       config: as `default_config` makes it, with changes.
       known_tasks: of the control suite; those of other kinds are not checked here.
     """
-    for name in ("method", "task"):  # a ConfigDict takes None for any type
-        if not isinstance(config[name], str):
-            return [Fault(name, "must be a name", value=config[name])]
+    if not isinstance(config.method, str):  # a ConfigDict takes None for any type
+        return list(_problems(config, FIELDS, known_tasks))
     try:
         known = fields(config.method)
     except UsageError as error:
@@ -271,8 +270,9 @@ def problems(config: Config, known_tasks: tuple[str, ...]) -> list[Fault]:
 def _problems(
     config: Config, known: Mapping[str, Field], known_tasks: tuple[str, ...]
 ) -> Iterator[Fault]:
-    if ":" not in config.task and config.task not in known_tasks:
-        yield unknown_name("task", config.task, known_tasks)
+    task = config.task
+    if isinstance(task, str) and ":" not in task and task not in known_tasks:
+        yield unknown_name("task", task, known_tasks)
     bad = set()
     for name, field in known.items():
         value = read(config, name)
@@ -296,7 +296,7 @@ def _problems(
             yield Fault(end, f"is above {start}={first}", "it must not grow", last)
     adversary = config.get("discriminator", {}).get("batch_size", 0)
     if not {"batch_size", "discriminator.batch_size"} & bad and (
-        adversary > config.batch_size
+        isinstance(adversary, int) and adversary > config.batch_size
     ):
         yield Fault(
             "discriminator.batch_size",

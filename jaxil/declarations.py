@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 
 from jaxil.errors import Fault, unknown_name
 
-# The types of fields that --config.FIELD=TEXT can be read as.
-# What a field's default may be, and what users call it.
+# The types of fields that --config.FIELD=TEXT can be read as, and their names.
 KINDS = {
     bool: "True or False",
     int: "a whole number",

@@ -216,34 +216,35 @@ def _judged(what: str, value: str, advice: str, level: str = "warning") -> Findi
     return Finding(level if advice else "ok", what, value, advice)
 
 
-def _read_config(argv: list[str]) -> tuple[Any, str]:
-    """Returns the checked config, the paper's without --config, and the set-up's line.
+def _read_config(argv: list[str], said: list[str]) -> Any:
+    """Returns the checked config, the paper's without --config.
 
-    Only the first `startup.prepare` of a process tells what the user had set.
+    Adds the set-up's line to `said`: only a process's first one tells what the user
+    had set.
     """
     from jaxil import command
     from jaxil import config as jaxil_config
 
     define = functools.partial(command.define_config, default="pdac:cartpole_swingup")
     config = command.parse(argv, __doc__ or "", define).config
-    set_up = startup.prepare()
+    said.append(startup.prepare())
     from jaxil.environments import suite
 
     faults = jaxil_config.problems(config, suite.known_tasks())
     if faults:
         raise UsageError(faults)
-    return config, set_up
+    return config
 
 
 def main(argv: list[str]) -> int:
     """Prints the findings and returns the exit status."""
-    config, num_faults = None, 0
+    config, num_faults, said = None, 0, []
     try:
-        config, set_up = _read_config(argv)
+        config = _read_config(argv, said)
     except (ImportError, AttributeError) as error:  # a broken jax or simulator
         print(Finding("fault", "packages", f"{type(error).__name__}: {error}"))
-        num_faults, set_up = 1, startup.prepare()
-    print(Finding("ok", "set-up", set_up), flush=True)
+        num_faults = 1
+    print(Finding("ok", "set-up", (said or [startup.prepare()])[0]), flush=True)
     for finding in examine(config):
         print(finding, flush=True)
         num_faults += finding.level == "fault"

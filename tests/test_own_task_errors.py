@@ -30,6 +30,15 @@ def test_an_episode_that_replay_or_updates_cannot_use_is_said(monkeypatch):
     assert "num_steps=6 is more than an episode, which has 5 agent steps" in str(fault)
 
 
+def test_a_task_is_made_once_to_be_checked(monkeypatch):
+    """It may hold a port or a robot."""
+    made = []
+    monkeypatch.setitem(globals(), "single", lambda: made.append(Task()) or made[-1])
+    config = jaxil_config.default_config("drqv2", f"{__name__}:single")
+    assert assembly.problems(config) == []
+    assert len(made) == 1
+
+
 def test_a_run_without_an_update_says_so(monkeypatch, tmp_path):
     """Its episodes end before n-step returns begin, which no spec tells."""
 
@@ -61,14 +70,13 @@ def test_what_gymnasium_would_return_is_named(function, monkeypatch):
     )
 
 
-@pytest.mark.parametrize(("policy", "said"), [("three", "shape (3,); the task takes")])
-def test_an_action_of_another_shape_is_the_policys(policy, said, monkeypatch, tmp_path):
+def test_an_action_of_another_shape_is_the_policys(monkeypatch, tmp_path):
     monkeypatch.setitem(globals(), "short", lambda: Task())
-    monkeypatch.setitem(globals(), policy, lambda observation: np.zeros(3))
-    names = (f"--policy={__name__}:{policy}", f"--task={__name__}:short")
+    monkeypatch.setitem(globals(), "three", lambda observation: np.zeros(3))
+    names = (f"--policy={__name__}:three", f"--task={__name__}:short")
     ended = call("collect", *names, f"--output={tmp_path}/a.npz", "--num_episodes=1")
     assert ended.returncode == 2
-    assert said in ended.stderr
+    assert "returned shape (3,); the task takes (1,)" in ended.stderr
 
 
 def test_a_state_is_as_long_as_its_spec_says(monkeypatch):
@@ -117,16 +125,25 @@ def _trained(tmp_path_factory):
     return folder, json.loads((folder / "config.json").read_text())
 
 
-@pytest.mark.parametrize("change", ["task", "hidden_dim"])
+@pytest.mark.parametrize(
+    ("change", "value", "said"),
+    [
+        ("task", "cup_catch", "task='cup_catch' is unknown"),
+        ("task", "walker_walk", "walker_walk has observations (24,), the policy"),
+        ("hidden_dim", 7, "does not fit the checkpoint"),
+        ("observation", "pixels", "does not fit the checkpoint"),
+    ],
+)
 @pytest.mark.parametrize("command", ["evaluate", "collect"])
-def test_a_config_that_does_not_fit_the_run_is_one_message(command, change, trained):
+def test_a_config_that_does_not_fit_the_run_is_one_message(
+    command, change, value, said, trained
+):
     """Whoever edits config.json by hand is told so."""
     folder, stored = trained
-    config = stored["config"] | {change: {"task": "cup_catch", "hidden_dim": 7}[change]}
+    config = stored["config"] | {change: value}
     (folder / "config.json").write_text(json.dumps(stored | {"config": config}))
     flags = {"evaluate": [f"--workdir={folder}"], "collect": [f"--workdirs={folder}"]}
     output = [f"--output={folder}/out.npz"] if command == "collect" else []
     ended = call(command, *flags[command], *output)
     assert ended.returncode == 2
-    said = {"task": "task='cup_catch' is unknown", "hidden_dim": "not fit the checkp"}
-    assert said[change] in ended.stderr
+    assert said in ended.stderr

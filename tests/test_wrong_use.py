@@ -47,7 +47,8 @@ _BAD_VALUES = (
     ("learning_rate", None, ("learning_rate=None must be a number",)),
     ("encoder.channels", None, ("encoder.channels=None must be a list",)),
     ("demonstrations.source", None, ("demonstrations.source=None must be text",)),
-    ("task", None, ("task=None must be a name",)),
+    ("task", None, ("task=None must be text",)),
+    ("method", None, ("method=None must be text",)),
     ("logger", None, ("logger=None must be text",)),
 )
 

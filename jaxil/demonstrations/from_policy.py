@@ -30,7 +30,8 @@ def record(
     Args:
       output: the file, NAME.npz; replaced atomically.
       environment: a `PixelEnvironment` of the task, used by nothing else.
-      act: observation to action [A] in [-1, 1].
+      act: observation to action [A] in [-1, 1]; without a state of its own, since it
+        plays again if episodes of states turn out to differ in length.
       num_episodes: at least 1.
       task: its name, as in configs.
       action_repeat: the environment's.

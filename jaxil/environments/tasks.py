@@ -12,6 +12,7 @@ import atexit
 import contextlib
 import functools
 import math
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import dm_env
@@ -22,6 +23,8 @@ from jaxil import outside
 from jaxil.environments import suite
 from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.errors import Fault, UsageError, raised, unknown_name
+
+LengthProblems = Callable[[int], Iterable[Fault]]
 
 _GYMNASIUM = "gymnasium:"
 _RECORDED_SIZE, _LARGEST_RECORDED = 84, 160  # larger images would fill the memory
@@ -37,18 +40,22 @@ def names_code(task: str) -> bool:
     return ":" in task.removeprefix(_GYMNASIUM)
 
 
-def problems(task: str, **settings: Any) -> list[Fault]:
+def problems(
+    task: str, length_problems: LengthProblems = lambda steps: (), **settings: Any
+) -> list[Fault]:
     """Tries a task: makes it, resets it, takes a step, and looks at it.
 
     Args:
-      task: one of the suite is only made, and only if a camera has to be looked up.
+      task: one of the suite is only made.
+      length_problems: faults of an episode of so many agent steps.
       settings: those of `make_environment`.
     """
     if is_of_suite(task):
         if task not in suite.known_tasks():
             return [unknown_name("task", task, suite.known_tasks())]
         if not settings["camera"]:
-            return []
+            limit = settings["max_episode_frames"]
+            return [*length_problems(timing(task, settings["action_repeat"], limit)[1])]
     try:
         with make_environment(task, seed=0, **settings) as environment:
             if not is_of_suite(task):
@@ -57,11 +64,11 @@ def problems(task: str, **settings: Any) -> list[Fault]:
                 _ = environment.step_seconds
                 if settings["observation"] == "pixels":
                     environment.frame()
+            return [*length_problems(environment.episode_steps)]
     except UsageError as error:
         return [f if isinstance(f, Fault) else Fault("task", f) for f in error.faults]
     except (Exception, SystemExit) as error:  # whatever the user's task raises
         return [Fault("task", f"cannot be used: {raised(error)}", value=task)]
-    return []
 
 
 def make_environment(

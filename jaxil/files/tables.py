@@ -33,8 +33,8 @@ class CsvLog:
             dropped, and new ones are empty in old rows.
           resume_frame: rows after this frame are dropped, as is an incomplete last
             line.
-          kept_from: a new file does not replace an old one that has this frame or a
-            later one; the old one is renamed.
+          kept_from: an old file that goes on after this frame is renamed, not replaced
+            by a new one.
           say: receives a message if an old file, damaged or not, is renamed.
         """
         self._path = pathlib.Path(path)
@@ -47,7 +47,7 @@ class CsvLog:
                 frames = [float(row["frame"]) for row in rows]
                 if resume_frame is None:
                     rows = []
-                    if max(frames, default=0) >= kept_from:
+                    if any(frame >= kept_from for frame in frames[:-1]):
                         aside = _set_aside(self._path, "old")
                         say(f"no checkpoint: the former {name} is kept as {aside.name}")
                 else:

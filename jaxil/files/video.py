@@ -49,7 +49,9 @@ def write_video(
     with writing.replacing(path) as temporary:
         try:
             # FFmpeg opens the file: a Python file would hide why it cannot be written.
-            with av.open(str(temporary), "w", "mp4", options=options) as container:
+            # Absolute, since it takes what comes before a colon for a protocol.
+            name = str(temporary.absolute())
+            with av.open(name, "w", "mp4", options=options) as container:
                 stream = container.add_stream(
                     "libx264",
                     Fraction(fps).limit_denominator(60_000),

@@ -16,8 +16,7 @@ _TEMPORARY = re.compile(r"\.tmp-.*|\.deleting_.*")
 def obstacle(folder: str | os.PathLike) -> str | None:
     """Returns why nothing can be written in a folder, which need not exist; else None.
 
-    Tried with a file without a name: permissions alone do not tell a full or read-only
-    disk.
+    Tried with a file without a name: permissions alone do not tell a read-only disk.
     """
     path = pathlib.Path(folder).absolute()
     # Not pathlib's `exists`, which raises in folders that it may not search.

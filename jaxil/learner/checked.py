@@ -1,5 +1,6 @@
 """What a method returns, checked where it is traced: mistakes of one's own methods."""
 
+import contextlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -72,25 +73,37 @@ def checked_rewarder(name: str, rewarder: Rewarder) -> Rewarder:
     checked = rewarder._replace(
         rewards=rewards, observe=observe, update=update, summary=summary
     )
-    if ":" not in name:
-        return checked
     hooks = {part: f for part, f in checked._asdict().items() if callable(f)}
     return checked._replace(**{part: _told(name, part, f) for part, f in hooks.items()})
 
 
 def _require_scalars(name: str, function: str, metrics: Mapping[str, Any]) -> None:
     for metric, value in metrics.items():
-        if value is None or jnp.shape(value):
-            what = "None" if value is None else f"shape {jnp.shape(value)}"
-            raise MethodError(
-                f"{name}: `{function}` returned the metric {metric!r} of {what}; "
-                "expected a scalar"
-            )
+        if value is None or isinstance(value, str):
+            what = type(value).__name__
+        elif shape := jnp.shape(value):
+            what = f"shape {shape}"
+        else:
+            continue
+        raise MethodError(
+            f"{name}: `{function}` returned the metric {metric!r} of {what}; expected "
+            "a scalar"
+        )
+
+
+def told(name: str, part: str) -> contextlib.AbstractContextManager[None]:
+    """Tells errors in a method's function as one message, if it is the user's own.
+
+    Of jaxil's and installed methods they are faults that need a traceback.
+    """
+    if ":" not in name:
+        return contextlib.nullcontext()
+    return told_as(name, f"`{part}`", MethodError)
 
 
 def _told(name: str, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
     def call(*arguments: Any) -> Any:
-        with told_as(name, f"`{part}`", MethodError):
+        with told(name, part):
             return function(*arguments)
 
     return call

@@ -125,7 +125,8 @@ def damage(run: Run) -> str:
     try:
         written = (run.folder / "config.json").stat().st_mtime_ns
     except FileNotFoundError:
-        return ""
+        orphaned = workdir.newest_checkpoint(run.folder) is not None
+        return f"{run.folder} has checkpoints but no config.json" if orphaned else ""
     except OSError as error:
         return f"{run.folder} is not readable ({error.strerror})"
     return _config_damage(run.folder, written)

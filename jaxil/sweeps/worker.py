@@ -23,6 +23,7 @@ from jaxil.sweeps.state import Run
 _ROOT = pathlib.Path(__file__).parents[2]  # where the package is
 _POLL_SECONDS = 0.2
 _IDLE_SECONDS = 2.0
+_ENDING_SECONDS = 60.0  # from a run's last checkpoint to the end of its process
 _STOPPED_STATUS = 130  # of jaxil.launch, when someone asked it to stop
 _WRONG_USE_STATUS = 2
 # A run is asked to stop by SIGHUP, which is harmless if it was asked before: a second
@@ -84,8 +85,13 @@ class Worker:
         """Trains a run; returns False if another process has it and may abandon it."""
         if state.damage(run):
             return True
-        if state.is_finished(run):  # its process may not have ended yet
-            return not state.is_in_use(run)
+        if state.is_finished(run):
+            end = time.monotonic() + _ENDING_SECONDS  # it may write its last video
+            while state.is_in_use(run) and not self.must_stop:
+                if time.monotonic() > end:  # someone trains it for longer
+                    break
+                time.sleep(_IDLE_SECONDS)
+            return True
         try:
             run.folder.mkdir(parents=True, exist_ok=True)
             with locking.locked(run.folder / "claim"):

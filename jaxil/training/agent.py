@@ -13,9 +13,9 @@ from jaxil import methods
 from jaxil.config import Config
 from jaxil.demonstrations import loading
 from jaxil.environments.pixel_environment import PixelEnvironment
-from jaxil.errors import Fault, MethodError, UsageError, told_as
+from jaxil.errors import Fault, UsageError
 from jaxil.learner.averaging import begin_average, make_averaging_step
-from jaxil.learner.checked import checked_rewarder
+from jaxil.learner.checked import checked_rewarder, told
 from jaxil.learner.gathering import Step, make_gathering_step, make_repeated_step
 from jaxil.learner.policy import (
     MeanAction,
@@ -192,7 +192,7 @@ def make_rewarder(config: Config, networks: AgentNetworks) -> Rewarder:
         names = ", ".join(fields) or "none"
         way_out = f"give it the agent and, as keywords, the declared fields ({names})"
         raise UsageError(Fault("method", rule, way_out, config.method)) from error
-    with told_as(config.method, f"`{method.make_rewarder}`", MethodError):
+    with told(config.method, method.make_rewarder):
         rewarder = make(agent, **fields)
     if not isinstance(rewarder, Rewarder):
         rule = f"{function} returns {type(rewarder).__name__}"
@@ -248,7 +248,7 @@ def make_agent(
     step = make_update_step(learner)
     if method.make_update_step is not None:
         make_step = methods.load(config.method, method.make_update_step)
-        with told_as(config.method, f"`{method.make_update_step}`", MethodError):
+        with told(config.method, method.make_update_step):
             step = make_step(learner, **_own_fields(config))
     averages = config.policy_tau < 1.0
     if averages:

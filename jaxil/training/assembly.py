@@ -47,13 +47,12 @@ def problems(config: Config) -> list[Fault]:
     if isinstance(config.logger, str):
         faults += loggers.problems(config.logger)
     bad = {fault.subject.partition(".")[0] for fault in faults}
-    if not bad & {"task", *_environment_settings(config)}:
-        found = task_problems(config)
-        if not found and not bad & {"replay_size_steps", "num_steps"}:
-            found = list(_length_problems(config))
+    if not bad & {"task", "method", *_environment_settings(config)}:
+        checks_length = not bad & {"replay_size_steps", "num_steps"}
+        found = task_problems(config, checks_length=checks_length)
         faults += found
         bad |= {fault.subject for fault in found}
-    if config.encoder.convolutions == "native" and "encoder" not in bad:
+    if config.encoder.convolutions == "native" and not bad & {"encoder", "method"}:
         fault = native_fault(config) or build.problem()
         if fault is not None:
             faults.append(
@@ -76,24 +75,22 @@ def problems(config: Config) -> list[Fault]:
     return faults
 
 
-def task_problems(config: Config) -> list[Fault]:
-    """Returns every reason why the task cannot be played."""
-    return tasks.problems(config.task, **_environment_settings(config))
+def task_problems(config: Config, *, checks_length: bool = False) -> list[Fault]:
+    """Returns every reason why the task, or a run of it, cannot be played."""
 
+    def length_problems(steps: int) -> Iterator[Fault]:
+        size, n = config.replay_size_steps, config.num_steps
+        if checks_length and steps > size:
+            rule = f"is less than an episode, which has {steps} agent steps"
+            way_out = f"use {steps} or more, or a smaller max_episode_frames"
+            yield Fault("replay_size_steps", rule, way_out, size)
+        if checks_length and steps < n and methods.get(config.method).plays:
+            rule = f"is more than an episode, which has {steps} agent steps"
+            way_out = f"use at most {steps}, or nothing is learned"
+            yield Fault("num_steps", rule, way_out, n)
 
-def _length_problems(config: Config) -> Iterator[Fault]:
-    """Yields faults of an episode's length, which no replay or update may exceed."""
-    size, n = config.replay_size_steps, config.num_steps
-    _, steps = tasks.timing(
-        config.task, config.action_repeat, config.max_episode_frames
-    )
-    if steps > size:
-        rule = f"is less than an episode, which has {steps} agent steps"
-        way_out = f"use {steps} or more, or a smaller max_episode_frames"
-        yield Fault("replay_size_steps", rule, way_out, size)
-    if steps < n:
-        rule = f"is more than an episode, which has {steps} agent steps: nothing learns"
-        yield Fault("num_steps", rule, f"use at most {steps}, or longer episodes", n)
+    settings = _environment_settings(config)
+    return tasks.problems(config.task, length_problems, **settings)
 
 
 def demonstration_fault(config: Config) -> str | None:

@@ -92,7 +92,7 @@ class RunLog:
                     workdir / f"{name}.csv",
                     columns,
                     resume_frame=frame,
-                    # A checkpoint had been saved by then, and was deleted since.
+                    # Rows after it mean a checkpoint, which was deleted since.
                     kept_from=config.checkpoint_every_frames,
                     say=say,
                 )

@@ -79,12 +79,6 @@ class Policy:
         actions = np.asarray(self._act(self.params.encoder, self.params.actor, batch))
         return actions[0] if is_single else actions
 
-    def check(self) -> None:
-        """Raises what a call would raise if the parameters do not fit the networks."""
-        shape = (1, *self.observation_shape)
-        one = jax.ShapeDtypeStruct(shape, self.observation_dtype)
-        jax.eval_shape(self._act, self.params.encoder, self.params.actor, one)
-
     def make_environment(self, seed: int = 0) -> PixelEnvironment:
         """Returns the task as the policy was trained on it.
 
@@ -130,7 +124,17 @@ def load(folder: pathlib.Path) -> tuple[Policy, PixelEnvironment]:
     policy = _policy(folder, workdir.read_config(folder))
     if faults := assembly.task_problems(policy.config):
         raise UsageError(faults)
-    return policy, assembly.evaluation_environment(policy.config)
+    environment = assembly.evaluation_environment(policy.config)
+    head = policy.params.actor["params"]["head"]["output"]["bias"]
+    for what, spec, shape in (
+        ("observations", environment.observation_spec(), policy.observation_shape),
+        ("actions", environment.action_spec(), head.shape),
+    ):
+        if spec.shape != shape:
+            environment.close()
+            why = f"{policy.config.task} has {what} {spec.shape}, the policy {shape}"
+            raise _unfit(folder, why)
+    return policy, environment
 
 
 def _policy(folder: pathlib.Path, config: Config) -> Policy:
@@ -150,10 +154,18 @@ def _policy(folder: pathlib.Path, config: Config) -> Policy:
     (action_dim,) = head["output"]["bias"].shape
     networks = agents.make_networks(config, action_dim, 0.5 if mean is None else mean)
     params = jax.tree.map(jax.numpy.asarray, params)
-    policy = Policy(config, networks, LearnerParams(**params), counters)
     try:
-        policy.check()
+        policy = Policy(config, networks, LearnerParams(**params), counters)
+        one = jax.ShapeDtypeStruct(
+            (1, *policy.observation_shape), policy.observation_dtype
+        )
+        act = make_mean_action(networks)
+        jax.eval_shape(act, policy.params.encoder, policy.params.actor, one)
     except (FlaxError, TypeError, ValueError) as error:
-        words = f"does not fit the checkpoint ({error}); restore it"
-        raise UsageError(f"{folder / 'config.json'} {words}") from error
+        raise _unfit(folder, str(error)) from error
     return policy
+
+
+def _unfit(folder: pathlib.Path, why: str) -> UsageError:
+    words = f"does not fit the checkpoint ({why}); restore it"
+    return UsageError(f"{folder / 'config.json'} {words}")

@@ -64,7 +64,7 @@ def test_pictures_are_read_in_the_order_of_their_numbers(tmp_path):
         Image.fromarray(frame).save(tmp_path / f"frame{index}.png")
     (tmp_path / "notes.txt").write_text("about them")
     recording, (episode,) = read_here(pictures, tmp_path)
-    assert recording.notes == ("1 other files, notes.txt first, are ignored.",)
+    assert recording.notes == ("notes.txt in its folder: not read.",)
     np.testing.assert_array_equal(episode.frames, FRAMES)
     deep = Image.fromarray(GRAY[0].astype(np.uint16) * 257)
     deep.save(tmp_path / "frame0.png")
@@ -86,10 +86,10 @@ def test_pictures_are_read_in_the_order_of_their_numbers(tmp_path):
         ),
         (
             lambda folder: (
-                (folder / "episode").mkdir(),
-                Image.fromarray(FRAMES[0]).save(folder / "episode" / "0.png"),
+                (folder / "next").mkdir(),
+                (folder / "next" / "0.png").write_text(""),
             ),
-            "frames beside episode, a folder of pictures",
+            "0.png, which is no PNG",
         ),
     ],
 )
@@ -101,11 +101,21 @@ def test_no_picture_is_left_out_silently(add, message, tmp_path):
         read_here(pictures, tmp_path)
 
 
+def test_what_lies_beside_frames_is_named(tmp_path):
+    (tmp_path / "masks").mkdir()
+    for name in ("0.png", "1.png", "masks/0.png"):
+        Image.fromarray(FRAMES[0]).save(tmp_path / name)
+    (tmp_path / "old.png").mkdir()
+    recording, (episode,) = read_here(pictures, tmp_path)
+    assert recording.notes == ("masks and 1 more in its folder: not read.",)
+    assert len(episode.frames) == 2
+
+
 def test_a_preview_beside_an_array_is_ignored(tmp_path):
     np.save(tmp_path / "images.npy", FRAMES)
     Image.fromarray(FRAMES[0]).save(tmp_path / "preview.png")
     recording, (episode,) = read_here(pictures, tmp_path)
-    assert recording.notes == ("1 other files, preview.png first, are ignored.",)
+    assert recording.notes == ("preview.png in its folder: not read.",)
     np.testing.assert_array_equal(episode.frames, FRAMES)
 
 

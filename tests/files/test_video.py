@@ -65,6 +65,12 @@ def test_odd_sizes_are_padded(tmp_path):
     assert size == (258, 324)
 
 
+def test_a_name_may_have_a_colon(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_video("pdac:1.mp4", plain_frames(2, (9, 9, 9)), fps=10)
+    assert len(read_video(tmp_path / "pdac:1.mp4")[2]) == 2
+
+
 def test_a_long_strip_is_not_enlarged_without_bound(tmp_path):
     write_video(tmp_path / "strip.mp4", plain_frames(2, (9, 9, 9), (2, 1500)), fps=10)
     size, _, _ = read_video(tmp_path / "strip.mp4")

@@ -88,7 +88,7 @@ def test_an_error_of_ones_own_method_is_one_message(error, part):
     ("found", "named"),
     [
         (None, "returned NoneType; expected scalars by name"),
-        ({"mine/a": None}, "'mine/a' of None"),
+        ({"mine/a": None}, "'mine/a' of NoneType"),
         ({"mine/a": np.zeros(2)}, r"'mine/a' of shape \(2,\)"),
     ],
 )

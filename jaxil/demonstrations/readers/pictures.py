@@ -5,6 +5,7 @@ is one. An array is one episode [T, H, W] or [T, H, W, C]. Files are in the orde
 their names, numbers by value.
 """
 
+import contextlib
 import pathlib
 import re
 from collections.abc import Iterator
@@ -25,6 +26,7 @@ from jaxil.demonstrations.readers.recording import (
     ReadOptions,
     Recording,
     first_bytes,
+    ignored,
     naming,
 )
 
@@ -61,10 +63,9 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
                     stored = frame.shape[:2]
                     size = wanted_size(stored, options)
                 if frame.shape[:2] != stored:
-                    (height, width), (first, second) = frame.shape[:2], stored
-                    raise FormatError(
-                        f"has pictures of {second}x{first} and {width}x{height} pixels"
-                    )
+                    sizes = [f"{w}x{h}" for h, w in (stored, frame.shape[:2])]
+                    what = f"has pictures of {' and '.join(sizes)} pixels"
+                    raise FormatError(f"{what}; make them one size")
                 frames.append(resized(frame, size, options.fit))
                 name = f"{len(frames)} or more frames of {size[1]}x{size[0]} pixels,"
                 num_bytes = len(frames) * frames[0].nbytes
@@ -92,20 +93,21 @@ def _ignored(path: pathlib.Path, used: set[pathlib.Path]) -> tuple[str, ...]:
     """Returns a note of the files in a folder, and in those of episodes, not `used`.
 
     Raises:
-      FormatError: one of them has a picture's name or is an episode, so it was meant.
+      FormatError: one of them has a picture's name but is none.
     """
     folders = {path, *(file.parent for file in used)}
     others = [x for each in sorted(folders) for x in _visible(each) if x not in used]
     others = [x for x in others if x not in folders]
-    for file in others:
-        if file.suffix.lower() in _SUFFIXES and not _starts(file, *_PICTURES):
-            raise FormatError(f"holds {file.name}, which is no PNG or JPEG picture")
-        if file.is_dir() and any(_starts(x, *_PICTURES) for x in _visible(file)):
-            what = f"holds frames beside {file.name}, a folder of pictures"
-            raise FormatError(f"{what}; keep one kind")
-    if not others:
-        return ()
-    return (f"{len(others)} other files, {others[0].name} first, are ignored.",)
+    for other in others:
+        with contextlib.suppress(PermissionError):
+            inside = _visible(other) if other.is_dir() else [other]
+            if any(_starts(file, *_PICTURES) for file in inside):
+                continue  # masks, thumbnails
+            for file in inside:
+                if file.suffix.lower() in _SUFFIXES and not file.is_dir():
+                    what = f"holds {file.name}, which is no PNG or JPEG picture"
+                    raise FormatError(f"{what}; replace or remove it")
+    return (ignored(others),) if others else ()
 
 
 def _visible(folder: pathlib.Path) -> list[pathlib.Path]:

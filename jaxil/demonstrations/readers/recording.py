@@ -10,7 +10,7 @@ files are opened.
 import contextlib
 import json
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -115,6 +115,12 @@ def checked_episode(index: int, episode: PixelEpisode) -> PixelEpisode:
             raise FormatError(f"has {name} in episode {index} that are not finite")
         numbers[name] = values
     return episode._replace(**numbers)
+
+
+def ignored(files: Sequence[pathlib.Path]) -> str:
+    """Returns a note on files of a folder that are not read."""
+    more = f" and {len(files) - 1} more" if len(files) > 1 else ""
+    return f"{files[0].name}{more} in its folder: not read."
 
 
 @contextlib.contextmanager

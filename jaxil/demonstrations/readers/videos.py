@@ -21,6 +21,7 @@ from jaxil.demonstrations.readers.recording import (
     ReadOptions,
     Recording,
     first_bytes,
+    ignored,
     naming,
 )
 
@@ -67,7 +68,7 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
             f"{files[0].name} has unevenly spaced frames, read as evenly spaced.",
         )
     if others:
-        notes += (f"{len(others)} other files, {others[0].name} first, are ignored.",)
+        notes += (ignored(others),)
     yield Recording(
         kind="folder of videos" if path.is_dir() else "video",
         num_episodes=len(files),
