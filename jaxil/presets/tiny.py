@@ -35,8 +35,8 @@ shadows. Other deviations from the paper:
   time per frame. Rewards by transport stay as they were stored there: with P-SIL's
   recomputed one of nine runs reached 80 % of the expert within 71k to 202k frames, with
   stored ones all of eight within 80k to 180k; with SIL's recomputed none of three
-  within 120k, stored all of three within 180k. TemporalOT and ORCA were tried with
-  stored ones alone.
+  within 120k, with stored ones two of three within 160k. TemporalOT and ORCA were tried
+  with stored ones alone.
 - cartpole_swingup is seen by the camera that follows the cart. DrQ-v2's shows the pole
   one pixel wide, and not at all at the rail's ends: agents needed more frames, and then
   kept dropping the pole. Demonstrations in pixels of another renderer may need
