@@ -132,7 +132,7 @@ class Checkpoints:
             "num_episodes": added,
             "episodes": episodes,
             "episode_steps": [len(each) for each in rewards],
-            "episode_checksums": [self._checksums.get(index) for index in episodes],
+            "episode_checksums": [self._checksums[index] for index in episodes],
         }
         path = self._free_path(frame)
         with writing.replacing(path) as temporary:
