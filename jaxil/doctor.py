@@ -269,9 +269,12 @@ def device_memory_bytes(config: Any) -> int:
 
 
 def _ring_sizes(config: Any) -> dict[str, Any]:
+    from jaxil.environments import tasks
+
+    length = config.action_repeat, config.max_episode_frames
     return {
         "capacity_steps": config.replay_size_steps,
-        "episode_steps": max(1000 // config.action_repeat, 1),
+        "episode_steps": tasks.timing(config.task, *length)[1],
         "observation_shape": (config.image_size, config.image_size, 3),
         "observation_dtype": "uint8",
     }

@@ -75,7 +75,7 @@ class UsageError(Exception):
         shown = [printable(fault, _MAX_FAULT) for fault in self.faults]
         if len(shown) == 1:
             return shown[0]
-        return "Invalid configuration:\n" + "\n".join(f"  - {f}" for f in shown)
+        return "Several faults:\n" + "\n".join(f"  - {f}" for f in shown)
 
 
 class RunFailed(RuntimeError):

@@ -118,7 +118,7 @@ def _stay(cluster: clusters.Cluster, statuses: Statuses, folder: str) -> int:
         was_interrupted = True
     tell()
     statuses = _look(list(statuses))
-    print(f"\n{tables.summary(statuses)}")
+    print(f"\n{tables.counts(statuses.values())}")
     if was_interrupted:
         print("stopped; rerun the same command to resume", file=sys.stderr)
         return 130

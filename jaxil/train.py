@@ -181,16 +181,16 @@ class Run(Parts):
         rewards_by_kind = {"task": episode.rewards, "imitation": rewards}
         self.returns = as_floats({n: np.sum(r) for n, r in rewards_by_kind.items()})
         later_steps = sum(len(each.actions) for each in later)
-        self.log.episode(
-            frame=self.frame - later_steps * self.config.action_repeat,
-            seconds=self.counters.seconds,
-            episode=self.counters.num_episodes,
-            task_return=self.returns["task"],
-            imitation_return=self.returns["imitation"],
-            length=len(rewards),
-            reward_seconds=self.stopwatch.reward_seconds,
-            metrics=metrics,
-        )
+        row = {
+            "task_return": self.returns["task"],
+            "imitation_return": self.returns["imitation"],
+            "length": len(rewards),
+            "reward_seconds": round(self.stopwatch.reward_seconds, 3),
+            **metrics,
+        }
+        frame = self.frame - later_steps * self.config.action_repeat
+        counters = self.counters
+        self.log.episode(frame, counters.seconds, counters.num_episodes, row)
         self.counters.num_episodes += 1
 
     def reward(self, episode: Episode) -> np.ndarray:

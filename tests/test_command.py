@@ -168,7 +168,7 @@ def test_all_faults_are_one_message():
         assert words in fault
     # batch_size is also below that of the discriminator, which is another fault.
     message = str(UsageError(told))
-    assert message.startswith("Invalid configuration:\n  - 'stray'")
+    assert message.startswith("Several faults:\n  - 'stray'")
     assert message.count("\n") == len(told)
 
 

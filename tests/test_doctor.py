@@ -197,6 +197,12 @@ def test_memory_is_compared_with_the_replay(monkeypatch, config):
     assert one(doctor.memory(config), "memory").level == "warning"
 
 
+def test_short_episodes_need_a_frame_more_each(config):
+    config.replay_on_device, config.max_episode_frames = True, 2 * config.action_repeat
+    frames = doctor.device_memory_bytes(config)
+    assert frames == 1.5 * config.replay_size_steps * 48 * 48 * 3
+
+
 def test_states_take_little_memory(monkeypatch, config):
     monkeypatch.setattr(memory, "available_bytes", lambda: int(1e9))
     config.observation = "state"

@@ -71,6 +71,8 @@ def test_damaged_runs_do_not_end_the_report_of_the_others(tmp_path):
     name = b"\xff".decode(errors="surrogateescape")
     odd = write_run(tmp_path / "runs" / name, "pdac", "walker_walk", 2, {1000: 1e308})
     (odd / "failed.json").write_text("[" * 200_000)
+    endless = write_run(tmp_path / "runs" / "endless", "pdac", "walker_walk", 3, None)
+    (endless / "failed.json").write_text('{"exit_status": 1e999}')
     report.main(["report", str(tmp_path / "runs"), f"--output={tmp_path}/out"])
     text = (tmp_path / "out" / "index.html").read_text()
     for words in (

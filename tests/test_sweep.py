@@ -53,7 +53,7 @@ def test_one_failure_stops_nothing_and_is_tried_again_by_the_next_sweep(
     runs = [bad, *(_quick(tmp_path, name) for name in ("one", "two", "three"))]
     assert _start(runs, tmp_path).wait(_SECONDS) == 0
     statuses = {run: state.status(run) for run in runs}
-    assert tables.summary(statuses) == "1 failed, 3 finished"
+    assert tables.counts(statuses.values()) == "1 failed, 3 finished"
     tables.print_failures(statuses)
     shown = capsys.readouterr().out
     assert "bad/zero/seed0 failed (exit status 3)" in shown

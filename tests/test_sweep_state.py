@@ -70,7 +70,7 @@ def test_a_damaged_run_is_shown_and_the_others_go_on(tmp_path, name, content, ca
     (bad.folder / name).write_bytes(content)
     assert make_runs(tmp_path, methods=["pdac"], tasks=["walker_run"]) == [bad, good]
     statuses = {run: state.status(run) for run in (bad, good)}
-    assert tables.summary(statuses) == "1 damaged, 1 missing"
+    assert tables.counts(statuses.values()) == "1 damaged, 1 missing"
     tables.print_plan(statuses)
     tables.watch(lambda: statuses)
     assert "seed0 is damaged: " in capsys.readouterr().out

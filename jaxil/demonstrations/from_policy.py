@@ -9,7 +9,7 @@ import numpy as np
 from jaxil.demonstrations import playing, states
 from jaxil.demonstrations.readers import own
 from jaxil.demonstrations.readers.recording import Recording
-from jaxil.environments.interaction import Restorable
+from jaxil.environments import suite
 from jaxil.errors import told_as
 
 
@@ -65,7 +65,7 @@ def record(
         "num_episodes": num_episodes,
         "finished": lambda episode, task_return: returns.append(task_return),
     }
-    if isinstance(environment, Restorable):
+    if isinstance(environment, suite.SuiteEnvironment):
         try:
             arrays = playing.play(**play)
         except playing.LengthsDiffer as error:

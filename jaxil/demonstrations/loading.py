@@ -11,8 +11,7 @@ import numpy as np
 from jaxil.demonstrations import foreign, mismatch, rendering, states
 from jaxil.demonstrations.readers.recording import FormatError, Recording
 from jaxil.demonstrations.states import StateDemonstrations, fault, unreadable
-from jaxil.environments import tasks
-from jaxil.environments.interaction import Restorable
+from jaxil.environments import suite, tasks
 from jaxil.files import archive
 
 _WAY_OUT = "`jaxil collect --inspect=FILE` shows what a file holds"
@@ -331,7 +330,7 @@ def _model_sizes(task: str) -> dict[str, int]:
     """Returns the lengths of an action, and of qpos, qvel and act if there are any."""
     with tasks.make_environment(task, seed=0) as environment:
         sizes = {"actions": environment.action_spec().shape[0]}
-        if isinstance(environment, Restorable):
+        if isinstance(environment, suite.SuiteEnvironment):
             states = environment.simulator_state()
             sizes |= {name: len(array) for name, array in states.items()}
         return sizes

@@ -23,7 +23,7 @@ def play(
 ) -> dict[str, np.ndarray]:
     """Plays episodes 0 ... K - 1; returns the arrays of `StateDemonstrations`.
 
-    `environment` is `Restorable`, and used by nothing else.
+    `environment` is a `SuiteEnvironment`, and used by nothing else.
 
     Raises:
       LengthsDiffer: an episode ended sooner, or later, than the first.

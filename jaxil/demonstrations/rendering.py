@@ -145,7 +145,7 @@ def observe_episodes(
                     finish(number - first_episode)
                     show(length)
         for index, each in list(missing.items()):
-            images = _images(environment, first_episode + index, each)
+            images = _observations(environment, first_episode + index, each)
             for time_index, image in enumerate(images):
                 observed[index, time_index] = image
                 show(1)
@@ -162,10 +162,10 @@ def num_processes(num_pixels: int, gl_name: str) -> int:
     return min(len(os.sched_getaffinity(0)), _MAX_PROCESSES)
 
 
-def _images(
+def _observations(
     environment: suite.SuiteEnvironment, number: int, states: States
 ) -> Iterator[np.ndarray]:
-    """Yields the images of an episode, uint8 [H, W, 3].
+    """Yields the frames of an episode, uint8 [H, W, 3], or its state vectors [S].
 
     The reset restores what is not in the states.
     """
@@ -252,7 +252,7 @@ def _render_episode(
     found = environment.renderer.gl_name()
     if found != gl_name:
         raise RuntimeError(f"rendered with {found}, not with {gl_name}")
-    return np.stack(list(_images(environment, number, states)))
+    return np.stack(list(_observations(environment, number, states)))
 
 
 _own_environment = functools.cache(tasks.make_environment)

@@ -36,7 +36,6 @@ _ARRAYS = {  # name: dtype, number of axes, entries beyond T
 _METADATA = {
     "task": str,
     "action_repeat": int,
-    "camera": int,
     "versions": dict,
     "seed": int,
     "first_episode": int,
@@ -97,7 +96,6 @@ def new_metadata(
         "version": VERSION,
         "task": task,
         "action_repeat": action_repeat,
-        "camera": suite.camera_of(task),
         "versions": {
             **suite.simulator_versions(),
             "jaxil": devices.version("jaxil") or devices.NOT_INSTALLED,

@@ -1,22 +1,8 @@
 """What passes between environments, one or several in parallel, and who plays them."""
 
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol
 
 import numpy as np
-
-
-@runtime_checkable
-class Restorable(Protocol):
-    """An environment whose simulator states can be stored, and rendered later."""
-
-    def simulator_state(self) -> dict[str, np.ndarray]:
-        """Returns the arrays that determine the simulator's state, by name."""
-        ...
-
-    def set_simulator_state(
-        self, qpos: np.ndarray, qvel: np.ndarray, act: np.ndarray
-    ) -> None:
-        """Sets the simulation to a state from `simulator_state`."""
 
 
 class Moment(NamedTuple):

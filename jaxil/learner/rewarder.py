@@ -84,32 +84,6 @@ class Spec(NamedTuple):
     observation_shape: tuple[int, ...]
 
 
-def _no_state(key: Array, spec: Spec, learner: LearnerParams) -> RewarderState:
-    del key, spec, learner
-    return ()
-
-
-def _keep(
-    state: RewarderState,
-    learner: LearnerParams,
-    view: AgentView,
-    expert: ExpertBatch | None,
-    key: Array,
-) -> tuple[RewarderState, Metrics]:
-    del learner, view, expert, key
-    return state, {}
-
-
-def _ignore_episode(
-    state: RewarderState,
-    learner: LearnerParams,
-    episode: AnyEpisode,
-    expert_episodes: ExpertEpisodes | None,
-) -> RewarderState:
-    del learner, episode, expert_episodes
-    return state
-
-
 class Rewarder(NamedTuple):
     """An imitation method as pure functions, like optax's (init, update).
 
@@ -149,14 +123,14 @@ class Rewarder(NamedTuple):
     rewards: Callable[
         [RewarderState, LearnerParams, AnyEpisode, ExpertEpisodes | None], Array
     ]
-    init: Callable[[Array, Spec, LearnerParams], RewarderState] = _no_state
+    init: Callable[[Array, Spec, LearnerParams], RewarderState] = lambda *_: ()
     update: Callable[
         [RewarderState, LearnerParams, AgentView, ExpertBatch | None, Array],
         tuple[RewarderState, Metrics],
-    ] = _keep
+    ] = lambda state, *_: (state, {})
     observe: Callable[
         [RewarderState, LearnerParams, AnyEpisode, ExpertEpisodes | None], RewarderState
-    ] = _ignore_episode
+    ] = lambda state, *_: state
     expert_batch_size: int = 0
     matches_episodes: bool = False
     samples_successors: bool = False

@@ -1,5 +1,6 @@
 """The host's memory: what is available, and what this process has used."""
 
+import functools
 import pathlib
 import resource
 
@@ -27,13 +28,15 @@ def available_bytes(root: pathlib.Path = pathlib.Path("/")) -> int | None:
     return min(bounds, default=None)
 
 
+@functools.cache
 def spare_bytes() -> int:
     """Returns how much memory demonstrations may use: half of what is available.
 
-    In whole GiB, so that the limit is the same when a file is read again.
+    Measured once: a file that was checked is in memory when it is loaded, and must not
+    be refused then.
     """
     available = available_bytes() or _ASSUMED_BYTES
-    return max(available // 2 // 2**30, 1) * 2**30
+    return max(available // 2, 2**30)
 
 
 def peak_bytes() -> int:

@@ -153,12 +153,11 @@ def _sheet(path: pathlib.Path, name: str, colour: str) -> Sheet | None:
         draw = functools.partial(plots.plan, weights=plan, step_seconds=step_seconds)
         panels.append(Panel("transport plan", draw, _PLAN_HEIGHT, margins))
         if {"agent_strip", "expert_strip"} <= stored.keys():
-            strips = (stored["agent_strip"], stored["expert_strip"])
             draw = functools.partial(
                 plots.alignment,
                 weights=plan,
-                agent_strip=strips[0],
-                expert_strip=strips[1],
+                agent_strip=stored["agent_strip"],
+                expert_strip=stored["expert_strip"],
                 step_seconds=step_seconds,
             )
             panels.append(Panel("alignment", draw, _ALIGNMENT_HEIGHT, margins))

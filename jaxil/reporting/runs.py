@@ -215,12 +215,17 @@ def _read_config(path: pathlib.Path) -> dict[str, Any]:
 
 
 def _exit_status(folder: pathlib.Path) -> str:
+    status = exit_status(folder)
+    return f"exit status {'unknown' if status is None else status}"
+
+
+def exit_status(folder: pathlib.Path) -> int | None:
+    """Returns the exit status of a run that a sweep saw fail; None if unknown."""
     try:
         content = untrusted.read_regular(folder / _FAILED, _MAX_CONFIG_BYTES)
-        status = int(json.loads(content)["exit_status"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return "exit status unknown"
-    return f"exit status {status}"
+        return int(json.loads(content)["exit_status"])
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+        return None
 
 
 def _setting(nested: Mapping[str, Any], field: str, default: Any) -> Any:

@@ -3,13 +3,15 @@
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
 from jaxil.learner.rewarder import Rewarder
 from jaxil.learner.state import LearnerParams
 from jaxil.maths.types import AnyEpisode, ExpertEpisodes
-from jaxil.rewarders.matching import scale_of_first_episode
+
+_COST_FLOOR = 1e-8  # keeps the scale finite if the first episode costs nothing
 
 # (agent features [T + 1, D], their number without padding [], expert features
 # [K, N + 1, D], their numbers without padding [K]) -> rewards [T + 1] of o_0 ... o_T, 0
@@ -76,10 +78,13 @@ def make_comparing_rewarder(
         state = update_features(state, learner, episode, expert_episodes)
         if return_scale is None:
             return state
-        scale = scale_of_first_episode(
-            state.scale,
-            lambda: unscaled(state, episode, expert_episodes),
-            return_scale,
+
+        def first(wanted: float) -> Array:
+            cost = -jnp.sum(unscaled(state, episode, expert_episodes))
+            return wanted / jnp.maximum(cost, _COST_FLOOR)
+
+        scale = jax.lax.cond(
+            state.scale > 0.0, lambda wanted: state.scale, first, return_scale
         )
         return state.replace(scale=scale)
 

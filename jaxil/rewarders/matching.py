@@ -11,8 +11,6 @@ from jax import Array
 
 from jaxil.maths import transport
 
-_COST_FLOOR = 1e-8  # keeps the scale finite if the first episode costs nothing
-
 
 class Matching(NamedTuple):
     """How two episodes are compared: what a pair of moments costs, which are paired.
@@ -90,25 +88,6 @@ def closest(costs: Array, plans: Array) -> tuple[Array, Array, Array]:
     candidates = jax.vmap(transport.transport_rewards)(costs, plans)
     index = jnp.argmax(jnp.sum(candidates, axis=1))
     return candidates[index], plans[index], index
-
-
-def scale_of_first_episode(
-    scale: Array, unscaled: Callable[[], Array], return_scale: float
-) -> Array:
-    """Returns the factor that gives the first episode the return `-return_scale`.
-
-    Args:
-      scale: returned as it is unless it is 0, as before the first episode. Shape [].
-      unscaled: returns the episode's rewards [T].
-      return_scale: 10 in the paper.
-    """
-
-    def first() -> Array:
-        rewards = unscaled()
-        chex.assert_rank(rewards, 1)
-        return return_scale / jnp.maximum(-jnp.sum(rewards), _COST_FLOOR)
-
-    return jax.lax.cond(scale > 0.0, lambda: scale, first)
 
 
 def make_matching(

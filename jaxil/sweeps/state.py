@@ -23,6 +23,7 @@ from jaxil.errors import UsageError, printable
 from jaxil.files import locking
 from jaxil.files.untrusted import open_regular, read_regular
 from jaxil.files.writing import write_atomically
+from jaxil.reporting import runs
 from jaxil.training import workdir
 
 _TAIL_BYTES = 16_384  # holds many rows of a table, and the last lines of a log
@@ -140,10 +141,7 @@ def note_failure(run: Run, exit_status: int) -> None:
 
 def failure(run: Run) -> int | None:
     """Returns the exit status that `note_failure` noted; None without."""
-    try:
-        return int(json.loads(read_regular(run.folder / "failed.json"))["exit_status"])
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
-        return None
+    return runs.exit_status(run.folder)
 
 
 def forget_failure(run: Run) -> None:

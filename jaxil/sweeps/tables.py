@@ -42,7 +42,7 @@ def print_plan(statuses: Statuses) -> None:
         cells.setdefault((run.task, run.slug), []).append(status)
     table = _table("task", "variant", "seeds")
     for (task, slug), seeds in sorted(cells.items()):
-        table.add_row(task, slug, _counts(seeds))
+        table.add_row(task, slug, counts(seeds))
     _console().print(table)
     for run, status in statuses.items():
         if status.state is State.DAMAGED:
@@ -95,9 +95,10 @@ def print_failures(statuses: Statuses) -> None:
             print(f"  again, by hand: {shlex.join(run.command)}")
 
 
-def summary(statuses: Statuses) -> str:
+def counts(statuses: Iterable[Status]) -> str:
     """Returns how many runs are in which state, such as "3 finished, 1 failed"."""
-    return _counts(statuses.values())
+    counter = collections.Counter(status.state for status in statuses)
+    return ", ".join(f"{counter[s]} {s}" for s in State if counter[s])
 
 
 def watch(look: Callable[[], Statuses]) -> Statuses:
@@ -135,7 +136,7 @@ def _live_table(statuses: Statuses) -> Table:
     order = list(State)
     rows = sorted(statuses.items(), key=lambda item: order.index(item[1].state))
     table = _table("task", "variant", "seed", "state", *_NUMBERS[1:])
-    table.title = summary(statuses)
+    table.title = counts(statuses.values())
     for run, status in rows:
         speed = status.frames_per_second
         left = run.total_frames - status.frame
@@ -159,11 +160,6 @@ def _table(*columns: str) -> Table:
         justify = "right" if column in _NUMBERS else "left"
         table.add_column(column, justify=justify, no_wrap=True)
     return table
-
-
-def _counts(statuses: Iterable[Status]) -> str:
-    counter = collections.Counter(status.state for status in statuses)
-    return ", ".join(f"{counter[s]} {s}" for s in State if counter[s])
 
 
 def _console() -> Console:

@@ -6,7 +6,7 @@ import pathlib
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -57,9 +57,10 @@ def measure(
                 results[name] = None
                 continue
             times = 10 * repeats if name in _SHORT_PARTS else repeats
-            timing = timed(function, times)
-            median, *ends = (1e3 * each / num_calls for each in timing)
-            results[name], results["ranges"][name] = median, ends
+            timings = [1e3 * each / num_calls for each in timed(function, times)]
+            # Not the mean: other processes only add time.
+            results[name] = float(np.median(timings))
+            results["ranges"][name] = [min(timings), max(timings)]
         results |= _time_loop(bench, steps)
         if full:
             bench.fill_replay()
@@ -134,27 +135,22 @@ def _product_flops_per_second() -> float:
     multiply, best = jax.jit(jnp.matmul), 0.0
     for size in _PRODUCT_SIZES:
         matrix = jax.random.normal(jax.random.key(0), (size, size), jnp.float32)
-        seconds = timed(functools.partial(multiply, matrix, matrix), 5).low
+        seconds = min(timed(functools.partial(multiply, matrix, matrix), 5))
         best = max(best, 2 * size**3 / seconds)
         if seconds > _LONG_SECONDS:
             break
     return best
 
 
-class Timing(NamedTuple):
-    """Seconds per call."""
+def timed(function: Callable[[], Any], repeats: int) -> list[float]:
+    """Returns the seconds of each call until its result is ready.
 
-    median: float  # not the mean: other processes only add time
-    low: float
-    high: float
-
-
-def timed(function: Callable[[], Any], repeats: int) -> Timing:
-    """Times a function until its result is ready, after a call that may compile."""
+    They follow one call that may compile.
+    """
     jax.block_until_ready(function())
     seconds = []
     for _ in range(repeats):
         begin = time.perf_counter()
         jax.block_until_ready(function())
         seconds.append(time.perf_counter() - begin)
-    return Timing(float(np.median(seconds)), min(seconds), max(seconds))
+    return seconds

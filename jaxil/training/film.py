@@ -11,8 +11,8 @@ from jaxil import config as jaxil_config
 from jaxil.config import Config
 from jaxil.demonstrations import rendering
 from jaxil.demonstrations.states import DemonstrationError
+from jaxil.environments import suite
 from jaxil.environments.evaluation import Evaluation, Stopped
-from jaxil.environments.interaction import Restorable
 from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.errors import told_as
 from jaxil.machine import progress, screen
@@ -46,7 +46,7 @@ def recorder(environment: PixelEnvironment, image_size: int) -> Callable[[], Any
     def record() -> tuple[np.ndarray | None, Any]:
         with told_as("the task", "an evaluation that is filmed"):
             view = environment.frame() if sees_pixels else None
-            if isinstance(environment, Restorable):
+            if isinstance(environment, suite.SuiteEnvironment):
                 return view, environment.simulator_state()
             return view, environment.render(image_size)
 
@@ -81,7 +81,7 @@ def sides(
     """
     views, moments = zip(*evaluation.recorded)
     seconds = environment.step_seconds
-    if not isinstance(environment, Restorable):
+    if not isinstance(environment, suite.SuiteEnvironment):
         frames = np.stack(moments)
     else:
         with _shown("the agent's episode", shows_progress, stop_asked) as show:

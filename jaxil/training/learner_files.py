@@ -108,6 +108,8 @@ def read(folder: pathlib.Path) -> tuple[dict, dict[str, np.ndarray]]:
                     learner=ocp.args.PyTreeRestore(), record=ocp.args.JsonRestore()
                 ),
             )
+        if restored.record["format"] != _FORMAT:
+            raise ValueError("another version of jaxil wrote it")
         arrays = {}
         for name, leaf in restored.record["leaves"].items():
             array = np.asarray(restored.learner.get(name, ()), leaf["dtype"])

@@ -108,34 +108,14 @@ class RunLog:
         self._last = (0, 0.0)  # frame and seconds of the last row
 
     def episode(
-        self,
-        *,
-        frame: int,
-        seconds: float,
-        episode: int,
-        task_return: float,
-        imitation_return: float,
-        length: int,
-        reward_seconds: float,
-        metrics: dict[str, float],
+        self, frame: int, seconds: float, episode: int, values: Mapping[str, Any]
     ) -> None:
-        """Logs a training episode."""
+        """Logs a training episode; `values` are the columns from `task_return` on."""
         last_frame, last_seconds = self._last
         speed = (frame - last_frame) / max(seconds - last_seconds, 1e-9)
         self._last = (frame, seconds)
-        self._write_training(
-            frame,
-            seconds,
-            episode,
-            {
-                "task_return": task_return,
-                "imitation_return": imitation_return,
-                "length": length,
-                "frames_per_second": round(speed, 2),
-                "reward_seconds": round(reward_seconds, 3),
-                **metrics,
-            },
-        )
+        row = {"frames_per_second": round(speed, 2), **values}
+        self._write_training(frame, seconds, episode, row)
 
     def updates(self, *, frame: int, seconds: float, metrics: dict[str, float]) -> None:
         """Logs the progress of a method that plays no episodes."""

@@ -4,6 +4,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from jaxil.environments.interaction import Environments
+
 
 class Stopwatch:
     """Sums the seconds of a run by activity."""
@@ -28,9 +30,9 @@ class Stopwatch:
 class TimedEnvironments:
     """Environments whose calls, waiting included, count as "environment"."""
 
-    def __init__(self, pool: Any, stopwatch: Stopwatch) -> None:
-        self.size = pool.size
-        self.reset = stopwatch.timed("environment", pool.reset)
-        self.step = stopwatch.timed("environment", pool.step)
-        self.receive = stopwatch.timed("environment", pool.receive)
-        self.close = pool.close
+    def __init__(self, environments: Environments, stopwatch: Stopwatch) -> None:
+        self.size = environments.size
+        self.reset = stopwatch.timed("environment", environments.reset)
+        self.step = stopwatch.timed("environment", environments.step)
+        self.receive = stopwatch.timed("environment", environments.receive)
+        self.close = environments.close

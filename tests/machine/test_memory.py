@@ -64,3 +64,11 @@ MEMINFO = {"proc/meminfo": "MemTotal:  2000 kB\nMemAvailable:    1000 kB\n"}
 )
 def test_the_tightest_limit_counts(tmp_path, files, expected):
     assert memory.available_bytes(machine(tmp_path, files)) == expected
+
+
+def test_demonstrations_that_were_checked_do_not_lower_their_own_limit(monkeypatch):
+    memory.spare_bytes.cache_clear()
+    left = iter([16 * 2**30, 9 * 2**30])  # before a file is read, and after
+    monkeypatch.setattr(memory, "available_bytes", lambda: next(left))
+    assert memory.spare_bytes() == memory.spare_bytes() == 8 * 2**30
+    memory.spare_bytes.cache_clear()

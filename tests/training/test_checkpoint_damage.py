@@ -12,6 +12,7 @@ import numpy as np
 import orbax.checkpoint
 import pytest
 
+from jaxil.training import learner_files
 from jaxil.training.checkpoint import CheckpointError, Checkpoints
 from jaxil.training.workdir import RunFolderError
 from tests.files.damaged_archives import set_header_byte
@@ -119,6 +120,17 @@ def test_a_damaged_newest_checkpoint_falls_back(tmp_path, seed):
     again = restore(tmp_path)
     assert_same_replay(restored, again.replay)
     assert not again.said
+
+
+def test_a_checkpoint_of_another_version_is_not_read_as_this_one(tmp_path, monkeypatch):
+    checkpoints, replay = Checkpoints(tmp_path), make_replay(4)
+    save(checkpoints, 1, replay)
+    monkeypatch.setattr(learner_files, "_FORMAT", 2)
+    save(checkpoints, 2, replay)
+    monkeypatch.undo()
+    _, _, state, _, (said,) = restore(tmp_path)
+    assert_same_state(make_state(1), state)
+    assert "another version of jaxil wrote it" in said
 
 
 def _become_a_folder(path):

@@ -41,16 +41,14 @@ def make_outputs():
 
 
 def write_episode(outputs, frame=1000, metrics=None):
-    outputs.episode(
-        frame=frame,
-        seconds=frame / 100,
-        episode=0,
-        task_return=12.5,
-        imitation_return=1.0,
-        length=500,
-        reward_seconds=0.0,
-        metrics=metrics or {"critic/loss": 0.25, "actor/pre_tanh": 4.0},
-    )
+    row = {
+        "task_return": 12.5,
+        "imitation_return": 1.0,
+        "length": 500,
+        "reward_seconds": 0.0,
+        **(metrics or {"critic/loss": 0.25, "actor/pre_tanh": 4.0}),
+    }
+    outputs.episode(frame, frame / 100, 0, row)
 
 
 def test_a_metric_that_the_method_does_not_declare_is_named(make_outputs, tmp_path):
