@@ -4,14 +4,14 @@ r"""Records, shows and converts demonstrations.
         --output=cartpole_swingup.npz --num_episodes=50
 
 evaluates the mean actions of the runs' policies and records the best. The file holds
-simulator states, from which each training renders pixels for its agent; for tasks that
+simulator states, from which each run renders pixels for its agent; for tasks that
 are not dm_control's, it holds pixels.
 
     jaxil collect --policy=package.module:function --task=gymnasium:ID \
         --output=FILE.npz
 
-records a function of the task's own observation, a flat vector or else the image, that
-returns an action with all numbers in [-1, 1].
+records a policy, a function from the task's own observation (a flat vector, or else the
+image) to an action with all numbers in [-1, 1].
 
     jaxil collect --inspect=FILE_OR_TASK
     jaxil collect --convert=IN --output=OUT.npz
@@ -311,9 +311,9 @@ def _define(values: flags.FlagValues) -> None:
     quality, fit = FIELDS["render_quality"], FIELDS["demonstrations.fit"]
     how = "how --convert and --inspect render states"
     choices("render_quality", quality.default, quality.choices, how)
-    how = "how --convert --image_size makes squares of frames that are not"
+    how = "how --convert --image_size makes frames square"
     choices("fit", fit.default, fit.choices, how)
-    text("camera", help="of a LeRobot dataset with several")
+    text("camera", help="which camera of a LeRobot dataset to read")
     number("frame_skip", 1, "keeps every N-th frame of pixels", 1, 10_000)
 
 

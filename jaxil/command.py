@@ -1,6 +1,6 @@
 """What all commands share: flags in, one message and an exit status out.
 
-Exit status: 0 done; 2 wrong use, with one message that names every fault; 130
+Exit status: 0 done; 2 usage error, with one message that names every fault; 130
 interrupted; 1 otherwise.
 """
 

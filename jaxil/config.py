@@ -70,14 +70,14 @@ FIELDS: dict[str, Field] = {
         10**9,
     ),
     "batch_size": Field(256, "256 in the paper", 1, 65_536),
-    "num_steps": Field(3, "of n-step returns; 3 in the paper, 1 on walkers", 1, 100),
+    "num_steps": Field(3, "n of n-step returns; 3 in the paper, 1 on walkers", 1, 100),
     "discount_factor": Field(0.99, "gamma; 0.99 in the paper", 0.0, 1.0),
     # The paper's table gives 2000 and 4000 for these two; DrQ-v2 and ROT, its source,
     # have 4000 frames before the first update and 2000 steps of uniform actions.
     "seed_frames": Field(4_000, "before the first update; 4000 in DrQ-v2", 1, 10**9),
     "exploration_steps": Field(2_000, "of uniform actions; 2000 in DrQ-v2", 0, 10**9),
     "update_every_steps": Field(2, "agent steps per update; 2 in the paper", 1, 10**6),
-    "updates_per_step": Field(1, "updates in a row each time; 1 in the paper", 1, 100),
+    "updates_per_step": Field(1, "updates whenever due; 1 in the paper", 1, 100),
     # DrQ-v2.
     "learning_rate": Field(
         1e-4, "of each network's Adam; 1e-4 in the paper", 0, 1, positive=True
@@ -90,21 +90,21 @@ FIELDS: dict[str, Field] = {
     "hidden_dim": Field(1024, "of actor and critic; 1024 in the paper", 1, 10**5),
     "critic_target_tau": Field(
         0.01,
-        "share of the new critic in its target; 0.01 in DrQ-v2",
+        "update rate of the target critic; 0.01 in DrQ-v2",
         0,
         1,
         positive=True,
     ),
     "policy_tau": Field(
         1.0,
-        "share of the newest policy in the average that is evaluated; 1: no average",
+        "weight of the newest policy in the evaluated average; 1: no averaging",
         0,
         1,
         positive=True,
     ),
-    "noise_clip": Field(0.3, "of the noise in updates; 0.3 in DrQ-v2", 0.0, 2.0),
-    "exploration_std_start": Field(1.0, "of the noise; 1 in the paper", 0.0, 10.0),
-    "exploration_std_end": Field(0.1, "its last; 0.1 in the paper", 0.0, 10.0),
+    "noise_clip": Field(0.3, "bound on noise in updates; 0.3 in DrQ-v2", 0.0, 2.0),
+    "exploration_std_start": Field(1.0, "initial std; 1 in the paper", 0.0, 10.0),
+    "exploration_std_end": Field(0.1, "final std; 0.1 in the paper", 0.0, 10.0),
     "exploration_std_steps": Field(
         500_000, "agent steps from start to end; 500000 in the paper", 1, 10**9
     ),
@@ -112,7 +112,7 @@ FIELDS: dict[str, Field] = {
         4, "pixels of the random shift; 4 in the paper, 0 for no augmentation", 0, 512
     ),
     "pre_tanh_penalty": Field(
-        0.0, "keeps small actors unsaturated; 0 in the paper", 0.0, 1e3
+        0.0, "weight of the actor-saturation penalty; 0 in the paper", 0.0, 1e3
     ),
     "encoder.channels": Field((32, 32, 32, 32), "of each convolution"),
     "encoder.kernel_sizes": Field((3, 3, 3, 3), "of each convolution"),
@@ -133,23 +133,23 @@ FIELDS: dict[str, Field] = {
         False, "keeps a copy of the replay's frames on the device; only speed changes"
     ),
     "updates_per_dispatch": Field(
-        1, "sent to the device at once; the policy lags by up to N - 1", 1, 1_000
+        1, "updates per device call; the policy lags by up to N - 1", 1, 1_000
     ),
     "num_environments": Field(
-        1, "in processes side by side; the policy lags by up to N - 1", 1, 64
+        1, "in parallel processes; the policy lags by up to N - 1", 1, 64
     ),
     "compute_dtype": Field(
         "float32", "of convolutions and trunks", choices=("float32", "bfloat16")
     ),
-    # Looking at it.
+    # Evaluation and logging.
     "eval_every_frames": Field(
         10_000, "between two evaluations; 10000 in DrQ-v2", 1, 10**10
     ),
-    "num_eval_episodes": Field(10, "in an evaluation; 10 in DrQ-v2", 1, 10**4),
-    "checkpoint_every_frames": Field(10_000, "most that a kill loses", 1, 10**10),
+    "num_eval_episodes": Field(10, "per evaluation; 10 in DrQ-v2", 1, 10**4),
+    "checkpoint_every_frames": Field(10_000, "most a kill can lose", 1, 10**10),
     "video_every_evals": Field(5, "0 turns videos off", 0, 10**6),
     "logger": Field(
-        "", "beside the tables and TensorBoard: wandb, or package.module:function"
+        "", "in addition to CSV and TensorBoard: wandb, or package.module:function"
     ),
 }
 # Fields that do not affect what is learned: they may differ between the seeds of one

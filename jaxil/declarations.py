@@ -1,4 +1,4 @@
-"""What a method declares of itself, and whether that can be used."""
+"""What a method declares about itself, and whether that can be used."""
 
 import math
 import re
@@ -55,7 +55,7 @@ class Variation(NamedTuple):
 
 
 class Method(NamedTuple):
-    """What the program knows of a method.
+    """What jaxil knows about a method.
 
     Attributes:
       name: how configs name it; `get` sets package.module:METHOD if it is not `known`.

@@ -5,7 +5,7 @@ r"""Checks whether this machine is ready for a run, and says what to do if not.
 Prints one line per check: ok, warning or fault; what was checked; the result; advice.
 Without --config it checks for the paper's settings.
 
-Exit status: 0 no faults; 1 a fault; 2 invalid arguments.
+Exit status: 0 no faults; 1 a fault; 2 usage error.
 """
 
 import contextlib

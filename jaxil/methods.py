@@ -31,14 +31,14 @@ _ENTRY_POINTS = "jaxil.methods"
 DISCRIMINATOR = {
     "hidden_dim": Field(1024, "width of its hidden layers; 1024 in ROT", 1, 10**5),
     "learning_rate": Field(1e-4, "of its Adam; 1e-4 in ROT", 0, 1, positive=True),
-    "gradient_penalty": Field(10.0, "weight of it; 10 in the paper", 0, 1e6),
+    "gradient_penalty": Field(10.0, "its weight; 10 in the paper", 0, 1e6),
     "batch_size": Field(
         128, "expert samples, and agent samples, in an update; 128 in ROT", 1, 65_536
     ),
 }
 COMPONENTS = Field(
     0,
-    "principal components of each frame to judge or compare; 0, the paper's: features",
+    "principal components of each frame to use; 0: features, as in the paper",
     0,
     1024,
 )
@@ -50,7 +50,7 @@ PDAC_DISCRIMINATOR = {
 CLONING = {
     "batch_size": Field(128, "expert samples; 128 in ROT", 1, 65_536),
     "std": Field(
-        0.1, "of the policy whose likelihood is raised; 0.1 in ROT", 1e-6, 10.0
+        0.1, "std of the policy in the likelihood loss; 0.1 in ROT", 1e-6, 10.0
     ),
 }
 # Beside these stand another method's sections. All fields are keyword arguments of one
@@ -58,11 +58,11 @@ CLONING = {
 PSEUDO_ACTIONS = {
     "num_pairs": Field(128, "expert transitions that are cloned", 1, 65_536),
     "weight": Field(
-        0.4, "of cloning, in units of mean |Q|; 0.4, 1 / 2.5 in TD3+BC", 0, 1e6
+        0.4, "of the cloning term, in units of mean |Q|; 1 / 2.5 in TD3+BC", 0, 1e6
     ),
     "trust": Field(
         "agreement",
-        "in a label: by its models' agreement; where the critic prefers it; always",
+        "what weights a label: its models' agreement; the critic's preference; nothing",
         choices=("agreement", "q_filter", "none"),
     ),
     "trust_scale": Field(
@@ -89,13 +89,13 @@ SINKHORN = {
     "cost": Field("cosine", "between features", choices=("cosine", "euclidean")),
     "alignment": Field(
         "transport",
-        "which moments are compared; time: moment t with moment t",
+        "how time steps are paired; time: step t with step t",
         choices=("transport", "time"),
     ),
     "epsilon": Field(
         0.01, "weight of the entropy, in units of cost; 0.01 in ROT", 1e-6, 1e3
     ),
-    "num_iterations": Field(100, "of Sinkhorn; 100 in ROT", 1, 10**6),
+    "num_iterations": Field(100, "Sinkhorn iterations; 100 in ROT", 1, 10**6),
     "return_scale": Field(
         10.0, "the first episode returns minus this; 10 in the paper", 1e-6, 1e6
     ),

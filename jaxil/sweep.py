@@ -6,9 +6,10 @@ r"""Trains many runs: tasks x variants x seeds, on this machine or a Slurm clust
     jaxil sweep --methods=drqv2 --preset=tiny --workdir=runs/tiny --watch
 
 Each run is an ordinary `python -m jaxil.launch` in DIR/TASK/VARIANT/seedN. Rerun the
-same command to do what is missing, cut off or failed; nothing is done twice.
---config.FIELD=VALUE changes a field in all runs that have it. Ctrl-C stops the runs of
-this machine, saved. Exit status 1: a run has failed, is damaged or is unfinished.
+same command to complete missing, interrupted and failed runs; finished ones are not
+repeated. --config.FIELD=VALUE changes a field in all runs that have it. Ctrl-C saves
+and stops the runs on this machine. Exit status 1: a run has failed, is damaged or is
+unfinished.
 """
 
 import os
@@ -186,9 +187,9 @@ def _define(values: flags.FlagValues) -> None:
     define(text, "workdir", None, "folder of all runs; made if missing")
     define(text, "cluster", "local", "local, slurm, or debug: one run, on all cores")
     define(yes, "dry_run", False, "only print the plan and the commands")
-    define(yes, "watch", False, "only show how far the runs are; Ctrl-C leaves them be")
+    define(yes, "watch", False, "only show progress; Ctrl-C does not stop the runs")
     define(number, "workers", None, "local: runs at a time; one per GPU, else per core")
-    define(flags.DEFINE_float, "hours", 24.0, "slurm: limit; then it is queued again")
+    define(flags.DEFINE_float, "hours", 24.0, "slurm: time limit, then requeued")
     define(text, "partition", "", "slurm: partition")
     define(number, "gpus", 1, "slurm: GPUs of a run, 0 or 1")
     define(number, "cpus", 4, "slurm: CPU cores of a run")

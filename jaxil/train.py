@@ -343,7 +343,7 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
         run.finish()
     if not (run.stop_asked or run.state.num_updates):
         screen.say("nothing was learned: lower seed_frames or num_steps")
-    ended, way_on = "finished", "a larger --config.total_frames trains on"
+    ended, way_on = "finished", "raise --config.total_frames to train further"
     if run.stop_asked:
         ended, way_on = "stopped", "rerun the same command to resume"
     screen.say(f"{ended} at frame {run.frame}, saved; {way_on}")

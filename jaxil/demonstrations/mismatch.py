@@ -13,7 +13,7 @@ _RATE_TOLERANCE = 0.1  # relative, of a video's frame rate
 _LARGEST_ACTION = 1.001  # 1, with room for rounding
 _MAX_SHOWN = 10
 _FITS = {  # of `demonstrations.fit`
-    "stretch": "squeezed into a square",
+    "stretch": "stretched to a square",
     "crop": "cut to the square in their middle",
     "pad": "with black bars",
 }

@@ -16,10 +16,10 @@ from jaxil.maths.types import AnyEpisode, ExpertBatch, Metrics
 def checked_rewarder(name: str, rewarder: Rewarder) -> Rewarder:
     """Returns the rewarder, which raises MethodError where it breaks its interface.
 
-    Checked are shapes and types, once for each compilation: rewards are [T],
-    metrics are scalars, and `observe` and `update` return a state like the one that
-    they got. A state that changed would train, and its checkpoint could not be loaded
-    again. An error that a user's own method raises becomes a MethodError too.
+    Shapes and types are checked once per compilation: rewards are [T], metrics are
+    scalars, and `observe` and `update` return a state like the one that they got. With
+    another state training would go on, but its checkpoint could not be restored. An
+    error that a user's own method raises becomes a MethodError too.
 
     Args:
       name: of the method, for the message; with a colon it is the user's own.

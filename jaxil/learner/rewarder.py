@@ -25,7 +25,7 @@ RewarderState = Any  # a pytree, the method's own
 
 
 class AgentSpec(NamedTuple):
-    """What a method is told of the agent when it is created.
+    """What a method is told about the agent when it is created.
 
     Attributes:
       networks: the agent's.

@@ -97,7 +97,7 @@ def logit_sheet(groups: Sequence[Group], *, name: str) -> Sheet | None:
 
 
 def metric_sheet(groups: Sequence[Group], *, name: str) -> Sheet | None:
-    """Plots what the methods log of themselves over frames; None without any."""
+    """Plots what the methods log about themselves over frames; None without any."""
     panels, found = [], []
     for task, task_groups in tasks_of(groups).items():
         declared = (figures.declaration(g.variant.method) for g in task_groups)

@@ -1,7 +1,7 @@
 """BCV-LR, behavioural cloning from videos via latent representations.
 
-A latent action is what the video's next observation tells beyond the one before. The
-agent's own play tells which action each stands for, and the policy clones those.
+A latent action encodes what the video's next observation adds to the one before. The
+agent's own experience shows which action each stands for, and the policy clones those.
 There is neither a reward nor a critic.
 """
 
@@ -64,18 +64,18 @@ METHOD = methods.Method(
                 positive=True,
             ),
             "commitment": methods.Field(
-                0.05, "weight of it; 0.05 in the authors' code", 0, 1e6
+                0.05, "its weight; 0.05 in the authors' code", 0, 1e6
             ),
             "prediction_weight": methods.Field(
                 1.0,
-                "of what the video teaches, beside the decoder's error; 1 in the "
-                "authors' code, where there is no such error beside it",
+                "of the losses on the video, beside the decoder's; 1 in the authors' "
+                "code, which adds no decoder loss there",
                 0,
                 1e6,
             ),
             "target_tau": methods.Field(
                 0.05,
-                "share of the new in the slow copy; 0.05 in the authors' code",
+                "update rate of the slow copy; 0.05 in the authors' code",
                 0,
                 1,
                 positive=True,

@@ -38,10 +38,10 @@ def make_rewarder(
         r_t = - scale * sum_n C_{t+1,n} P_{t+1,n}
 
     with cosine distances C and the Sinkhorn plan P to the demonstration that is
-    cheapest to reach. Compared are features of target copies of the encoder and the
-    actor's trunk or, with `num_components`, codes of the pixels; state vectors have no
-    code, so always their features. For the arguments see `make_matching`,
-    `make_target_rewarder` and `make_coded_rewarder`.
+    cheapest to reach. It compares features of target copies of the encoder and the
+    actor's trunk or, with `num_components`, principal components of the pixels; state
+    vectors have none, so their features are compared. See `make_matching`,
+    `make_target_rewarder` and `make_coded_rewarder` for the arguments.
 
     Source: Cohen et al. 2021, sec. 3.1, eqs. (1) to (5); epsilon, iterations and
     the copied trunk, which the paper leaves out, from siddhanthaldar/ROT.

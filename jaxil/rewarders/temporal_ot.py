@@ -15,7 +15,7 @@ from jaxil.rewarders.targets import make_target_rewarder
 METHOD = methods.Method(
     name="temporal_ot",
     label="TemporalOT",
-    about="optimal transport between moments of about the same time",
+    about="optimal transport within a temporal band",
     colour="#882255",
     rank=8,
     sections={

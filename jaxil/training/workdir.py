@@ -90,7 +90,7 @@ def problems(workdir: pathlib.Path, config: Config) -> list[Fault]:
     if not os.path.exists(workdir / "config.json"):
         if newest_checkpoint(workdir) is None:
             return []
-        rule = "has checkpoints but no config.json, which says whose they are"
+        rule = "has checkpoints but no config.json, to say which run they belong to"
         way_out = "restore it, or choose another with --workdir=DIR"
         return [Fault("workdir", rule, way_out, str(workdir))]
     try:
