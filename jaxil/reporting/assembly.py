@@ -49,6 +49,7 @@ def write_report(
         "by_frames": by_frames,
         "by_hours": by_hours,
         "bars": charts.bar_sheet(finals, name="final_returns"),
+        "early": charts.early_sheet(groups, name="sample_efficiency"),
         "distance": distance,
         "logits": charts.logit_sheet(groups, name="logits"),
         "metrics": charts.metric_sheet(groups, name="metrics"),
@@ -58,6 +59,7 @@ def write_report(
         tables.final_table(finals),
         tables.aggregate_table(finals),
         tables.efficiency_table(groups),
+        tables.early_table(groups),
         tables.seed_table(groups, num_seeds),
         tables.run_table(groups),
     ]

@@ -2,11 +2,15 @@
 
 import functools
 from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
 
 from jaxil.reporting import figures, measures, plots
 from jaxil.reporting.groups import Group, expert_returns, tasks_of
 from jaxil.reporting.measures import Curve, Final
 from jaxil.reporting.sheets import Panel, Sheet
+from jaxil.reporting.statistics import Estimate
 
 _RETURN = "task_return_mean"
 _LOGITS = ("discriminator/expert_logit", "discriminator/agent_logit")
@@ -56,19 +60,49 @@ def bar_sheet(finals: Sequence[Final], *, name: str) -> Sheet | None:
     tasks: dict[str, list[Final]] = {}
     for final in finals:
         tasks.setdefault(final.group.task, []).append(final)
-    panels = [
-        Panel(
-            task,
-            functools.partial(plots.bars, finals=task_finals),
-            plots.bars_height(len(task_finals)),
-            plots.BAR_MARGINS,
-        )
-        for task, task_finals in tasks.items()
-    ]
+    panels = []
+    for task, task_finals in tasks.items():
+        experts = {round(f.expert, 1) for f in task_finals if np.isfinite(f.expert)}
+        name_of_axis = "task return" + (", expert dashed" if experts else "")
+        rows = [
+            plots.Bar(
+                final.group,
+                final.returns,
+                final.mean,
+                final.group.num_finished < len(final.group.runs),
+            )
+            for final in task_finals
+        ]
+        panels.append(_bar_panel(task, rows, levels=sorted(experts), name=name_of_axis))
     caption = (
         "Mean over seeds of the last evaluation's mean return, its 90 % confidence "
         "interval (Student's t) and a dot for each seed. Hatched: some of these runs "
         "are unfinished."
+    )
+    return _sheet(name, panels, [], caption)
+
+
+def early_sheet(groups: Sequence[Group], *, name: str) -> Sheet | None:
+    """Plots how soon each group learns; None if no run is long enough.
+
+    With several tasks the first panel joins them, for variants that have all.
+    """
+    found = measures.early_by_task(groups)
+    joined = measures.early_over_tasks(found)
+    if joined:
+        found = {f"{len(found)} tasks together": joined, **found}
+    axis = "% of the expert's return, expert dashed"
+    panels = []
+    for title, shown in found.items():
+        rows = []
+        for each in shown:
+            percent = Estimate(*(100.0 * end for end in each.iqm))
+            rows.append(plots.Bar(each.group, 100.0 * each.shares, percent))
+        panels.append(_bar_panel(title, rows, levels=[100.0], name=axis))
+    caption = (
+        "Mean share of the expert's return up to "
+        f"{measures.EARLY_FRAMES:,} environment frames: interquartile mean over seeds, "
+        "its 90 % bootstrap interval and a dot for each run. Shorter runs are left out."
     )
     return _sheet(name, panels, [], caption)
 
@@ -120,6 +154,11 @@ def metric_sheet(groups: Sequence[Group], *, name: str) -> Sheet | None:
     if len(panels) > _MOST_METRICS:
         caption += f" The first {_MOST_METRICS} of {len(panels)}."
     return _sheet(name, panels[:_MOST_METRICS], found, caption)
+
+
+def _bar_panel(title: str, rows: Sequence[plots.Bar], **axis: Any) -> Panel:
+    draw = functools.partial(plots.bars, rows=rows, **axis)
+    return Panel(title, draw, plots.bars_height(len(rows)), plots.BAR_MARGINS)
 
 
 def _sheet(

@@ -1,5 +1,7 @@
 """Metrics of a group: curves, last returns, and sample efficiency."""
 
+import itertools
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -50,6 +52,20 @@ class Final(NamedTuple):
     shares: np.ndarray
 
 
+class Early(NamedTuple):
+    """How soon a group learns.
+
+    Attributes:
+      group: whose; joined over tasks, that of the first task.
+      shares: `early_share` of each run that has one. Shape [S], S >= 1.
+      iqm: their interquartile mean.
+    """
+
+    group: Group
+    shares: np.ndarray
+    iqm: Estimate
+
+
 def curve(group: Group, x: str, y: str, *, table: str = "evaluation") -> Curve | None:
     """Joins the seeds of a group; None if none has such a column.
 
@@ -90,6 +106,42 @@ def final(group: Group) -> Final | None:
     shares = returns / np.where(experts > 0, experts, np.nan)
     mean = statistics.mean_interval(returns)
     return Final(group, returns, mean, float(np.mean(experts)), shares)
+
+
+def early(group: Group) -> Early | None:
+    """Returns how soon a group learns; None if none of its runs is long enough."""
+    shares = np.array([early_share(run) for run in group.measured])
+    shares = shares[np.isfinite(shares)]
+    if not len(shares):
+        return None
+    return Early(group, shares, statistics.interquartile_interval([shares]))
+
+
+def early_by_task(groups: Sequence[Group]) -> dict[str, list[Early]]:
+    """Returns how soon the groups learn, for tasks where one of them is long enough."""
+    found: dict[str, list[Early]] = {}
+    for each in filter(None, map(early, groups)):
+        found.setdefault(each.group.task, []).append(each)
+    return found
+
+
+def early_over_tasks(tasks: Mapping[str, Sequence[Early]]) -> list[Early]:
+    """Joins two or more tasks, for the variants that were run on all of them.
+
+    The interval resamples seeds within each task.
+    """
+    if len(tasks) < 2:
+        return []
+    parts: dict[str, list[Early]] = {}
+    for each in itertools.chain(*tasks.values()):
+        parts.setdefault(each.group.label, []).append(each)
+    found = []
+    for same in parts.values():
+        if len(same) == len(tasks):
+            strata = [each.shares for each in same]
+            iqm = statistics.interquartile_interval(strata)
+            found.append(Early(same[0].group, np.concatenate(strata), iqm))
+    return found
 
 
 def arrivals(run: Run, x: str) -> list[float]:

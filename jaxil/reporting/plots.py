@@ -1,11 +1,13 @@
 """Plots one panel: curves, bars, logits, an episode's rewards, a transport plan."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxil.reporting.measures import Curve, Final
+from jaxil.reporting.groups import Group
+from jaxil.reporting.measures import Curve
+from jaxil.reporting.statistics import Estimate
 
 # Becomes the page's text colour, which is light on dark pages.
 INK = "#1b1c1e"
@@ -67,20 +69,44 @@ def curves(
     axes.grid(axis="y", alpha=0.16, lw=0.6, color=INK)
 
 
-def bars(axes: Any, finals: Sequence[Final]) -> None:
-    """Plots the mean of the last evaluations, hatched where a run is unfinished."""
-    experts = sorted({round(f.expert, 1) for f in finals if np.isfinite(f.expert)})
-    highest = max([1.0, *experts, *(float(f.returns.max()) for f in finals)])
-    bounds = [float(f.mean.high) for f in finals if np.isfinite(f.mean.high)]
+class Bar(NamedTuple):
+    """One bar.
+
+    Attributes:
+      group: gives it name and colour.
+      values: a dot each. Shape [S], S >= 1.
+      estimate: its length, and the interval.
+      is_hatched: such as for unfinished runs.
+    """
+
+    group: Group
+    values: np.ndarray
+    estimate: Estimate
+    is_hatched: bool = False
+
+
+def bars(
+    axes: Any, rows: Sequence[Bar], *, levels: Sequence[float] = (), name: str
+) -> None:
+    """Plots a bar for each group.
+
+    Args:
+      axes: Matplotlib's.
+      rows: from top to bottom, at least one.
+      levels: values to mark with a dashed line.
+      name: of the horizontal axis.
+    """
+    highest = max([1.0, *levels, *(float(bar.values.max()) for bar in rows)])
+    ends = [float(bar.estimate.high) for bar in rows]
+    bounds = [end for end in ends if np.isfinite(end)]
     # The interval of two seeds can be many times as long as their bar.
     highest = max([highest, *(min(bound, _BAND_ROOM * highest) for bound in bounds)])
-    for row, final in enumerate(finals):
-        colour = final.group.look.colour
+    for row, bar in enumerate(rows):
+        colour = bar.group.look.colour
         y = _BAR_LINES * (row + 0.68)
         text_y = _BAR_LINES * (row + 0.36)
-        axes.text(0, text_y, final.group.label, fontsize=8, va="bottom")
-        unfinished = final.group.num_finished < len(final.group.runs)
-        mean, low, high = map(float, final.mean)
+        axes.text(0, text_y, bar.group.label, fontsize=8, va="bottom")
+        mean, low, high = map(float, bar.estimate)
         axes.barh(
             y,
             mean,
@@ -88,15 +114,15 @@ def bars(axes: Any, finals: Sequence[Final]) -> None:
             color=colour,
             alpha=0.88,
             lw=0,
-            hatch="////" if unfinished else None,
+            hatch="////" if bar.is_hatched else None,
             edgecolor="#ffffff88",
         )
         if np.isfinite(high):
             axes.plot([low, min(high, highest)], [y, y], color=INK, lw=1.3, zorder=4)
         dots = {"ls": "", "marker": "o", "ms": 3.6, "mew": 0.8, "zorder": 5}
-        heights = np.full(len(final.returns), y)
-        axes.plot(final.returns, heights, mfc=colour, mec=INK, **dots)
-        top = float(np.nanmax([mean, high, final.returns.max()]))
+        heights = np.full(len(bar.values), y)
+        axes.plot(bar.values, heights, mfc=colour, mec=INK, **dots)
+        top = float(np.nanmax([mean, high, bar.values.max()]))
         axes.annotate(
             f"{mean:.0f}",
             (min(max(top, 0.0), highest), y),
@@ -105,14 +131,14 @@ def bars(axes: Any, finals: Sequence[Final]) -> None:
             va="center",
             fontsize=8.5,
         )
-    for expert in experts:
-        axes.axvline(expert, color=INK, ls=(0, (4, 3)), lw=0.9, alpha=0.75, zorder=1)
-    lowest = min(0.0, *(float(f.returns.min()) for f in finals))
+    for level in levels:
+        axes.axvline(level, color=INK, ls=(0, (4, 3)), lw=0.9, alpha=0.75, zorder=1)
+    lowest = min(0.0, *(float(bar.values.min()) for bar in rows))
     axes.set_xlim(lowest, 1.12 * highest)
-    axes.set_ylim(_BAR_LINES * len(finals), 0)
+    axes.set_ylim(_BAR_LINES * len(rows), 0)
     axes.set_yticks([])
     axes.spines["left"].set_visible(False)
-    axes.set_xlabel("task return" + (", expert dashed" if experts else ""))
+    axes.set_xlabel(name)
 
 
 def bars_height(rows: int) -> float:

@@ -15,7 +15,9 @@ from jaxil.reporting.measures import (
     Curve,
     Final,
     arrivals,
-    early_share,
+    early,
+    early_by_task,
+    early_over_tasks,
 )
 from jaxil.reporting.statistics import Estimate
 
@@ -198,12 +200,9 @@ def efficiency_table(groups: Sequence[Group]) -> Table:
             for unit, times in (("frames", frames), ("hours", hours)):
                 median = statistics.median_arrival([each[k] for each in times])
                 row[f"{unit}_{percent}"] = median
-        early = np.array([early_share(run) for run in runs])
-        early = early[np.isfinite(early)]
-        estimate = Estimate(*[np.asarray(_NAN)] * 3)
-        if len(early):
-            estimate = statistics.interquartile_interval([early])
-        row |= _interval(_EARLY, estimate)
+        soon = early(group)
+        unknown = Estimate(*[np.asarray(_NAN)] * 3)
+        row |= _interval(_EARLY, unknown if soon is None else soon.iqm)
         speeds = [run.frames_per_second for run in runs]
         rows.append({**row, "frames_per_second": np.median(speeds)})
     about = (
@@ -214,6 +213,22 @@ def efficiency_table(groups: Sequence[Group]) -> Table:
         "include evaluations."
     )
     return Table("sample_efficiency", "Sample efficiency", rows, about)
+
+
+def early_table(groups: Sequence[Group]) -> Table:
+    """Returns how soon each variant learns, over the tasks that have such runs."""
+    tasks = early_by_task(groups)
+    rows = []
+    for each in early_over_tasks(tasks):
+        row = {"variant": each.group.label, "tasks": len(tasks)}
+        row |= {"runs": len(each.shares), **_interval(_EARLY, each.iqm)}
+        rows.append(row)
+    about = (
+        "The IQM of the table above over all tasks, for variants with runs on each of "
+        "them. Seeds are resampled within each task."
+    )
+    name = "Sample efficiency over all tasks"
+    return Table("sample_efficiency_all_tasks", name, rows, about)
 
 
 def seed_table(groups: Sequence[Group], num_seeds: int | None) -> Table:
