@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxil import methods
-from jaxil.reporting import charts, episodes, groups, measures, remarks, runs, tables
+from jaxil.reporting import episodes, groups, measures, remarks, runs, tables
 from tests.reporting.run_folders import EVAL_HEADER, film, many_runs, write_run
 
 
@@ -23,32 +23,6 @@ def found(tmp_path_factory):
         else:
             read[str(folder.relative_to(root))] = run
     return read
-
-
-def test_how_soon_methods_learn_is_joined_over_the_tasks_that_they_share(tmp_path):
-    # From 0 straight to the expert's 1000 at 100k: 50 % in the mean; and so on.
-    write_run(tmp_path / "a", "pdac", "cartpole_swingup", 0, {100_000: 1000})
-    write_run(tmp_path / "b", "pdac", "cartpole_swingup", 1, {100_000: 800})
-    write_run(tmp_path / "c", "pdac", "walker_walk", 0, {100_000: 200})
-    write_run(tmp_path / "d", "psil", "cartpole_swingup", 0, {100_000: 600})
-    write_run(tmp_path / "e", "psil", "walker_walk", 0, {90_000: 1000})  # too short
-    made = groups.make_groups(map(runs.read, runs.find([tmp_path])))
-
-    (row,) = tables.early_table(made).rows
-    shown = {key: row[key] for key in ("variant", "tasks", "runs")}
-    assert shown == {"variant": "P-DAC", "tasks": 2, "runs": 3}
-    # Of 0.1, 0.4 and 0.5; with the bootstrap's 0.4 or 0.5 twice at its ends.
-    ends = [row[f"share_to_100k{end}"] for end in ("", "_low", "_high")]
-    np.testing.assert_allclose(ends, [1 / 3, 0.3, 1.1 / 3])
-
-    sheet = charts.early_sheet(made, name="sample_efficiency")
-    assert sheet is not None
-    titles = [panel.title for panel in sheet.panels]
-    assert titles == ["2 tasks together", "cartpole_swingup", "walker_walk"]
-    one = [group for group in made if group.task == "walker_walk"]
-    assert not tables.early_table(one).rows  # nothing to join
-    none = [group for group in one if group.label == "P-SIL"]
-    assert charts.early_sheet(none, name="sample_efficiency") is None
 
 
 def test_every_run_is_found_once(found, tmp_path):
