@@ -58,7 +58,7 @@ def parse(
             config_words.append(word)
         elif not {name, name.removeprefix("no")} & set(values):
             known = tuple(f"--{flag}" for flag in values)
-            faults.append(unknown_name("flag", f"--{name}", known))
+            faults.append(unknown_name("flag", word.partition("=")[0], known))
         else:
             try:
                 values([argv[0], word])

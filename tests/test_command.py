@@ -150,13 +150,13 @@ def test_switches():
 
 def test_all_faults_are_one_message():
     told = _faults(
-        *(PDAC, "stray", "--bogus=1", "--size=big", "--config.bath_size=8"),
+        *(PDAC, "stray", "-bogus=1", "--size=big", "--config.bath_size=8"),
         *("--config.seed=2.5", "--config.encoder.channels=32"),
         *("--config.task=walker_wlak", "--config.batch_size=0"),
     )
     expected = (
         "'stray' is not a flag; flags start with --",
-        "flag='--bogus' is unknown",
+        "flag='-bogus' is unknown",
         "--size is wrong",
         "field='bath_size' is unknown; did you mean: batch_size",
         "seed='2.5' has the wrong type: expected a whole number",
