@@ -60,7 +60,7 @@ _KINDS = {
 _EXPERIMENTS = {"pca32", "pca64", "dynamics", "cloning1", "cloning3", "cloning10"}
 _EXPERIMENTS |= {"beside", "layernorm", "centred", "std10k", "greedy", "reconstruction"}
 _EXPERIMENTS |= {"switched", "temporal", "inverse", "transitions", "twojudges"}
-_EXPERIMENTS |= {"pretrained", "rescaled", "decision"}
+_EXPERIMENTS |= {"pretrained", "rescaled", "decision", "differences"}
 _EXPERIMENTS |= {"lowrate", "scaled", "gradients", "nstep3", "decay"}
 _EXPERIMENTS |= {"noaug", "demos1", "demos50", "actions", "time"}  # of the claims
 # Fields that do not change what a run learns.
