@@ -77,7 +77,9 @@ class Dummies:
                 save=lambda **_: self.tape.append("save"), newest=lambda: 4000
             ),
             log=_part(
-                episode=lambda **row: self.rows.append(row),
+                episode=lambda frame, seconds, episode, row: self.rows.append(
+                    {"frame": frame, "seconds": seconds, "episode": episode, **row}
+                ),
                 evaluation=lambda *_, **__: "a line",
                 close=lambda: None,
             ),

@@ -164,7 +164,7 @@ def test_mismatches_are_warned_of(path, caplog):
     write(path, [episode, episode], action_repeat=4, frames_per_second=25.0)
     with caplog.at_level(logging.WARNING):
         load(path)
-    assert "12x6 pixels are resized to 8x8, squeezed" in caplog.text
+    assert "12x6 pixels are resized to 8x8, stretched" in caplog.text
     assert "action_repeat=4, but the run has 2" in caplog.text
     assert "25 frames per second, but the agent makes 50 steps" in caplog.text
     assert "a test" not in caplog.text  # its origin is no fault
