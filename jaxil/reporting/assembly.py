@@ -44,12 +44,14 @@ def write_report(
         groups, name="wasserstein", over="frame", column="wasserstein_to_expert"
     )
     finals = [f for f in map(measures.final, groups) if f is not None]
+    soon = measures.early_by_task(groups)
+    joined = measures.early_over_tasks(soon)
     filmed, left_out = episodes.collect(groups, num_videos)
     sheets = {
         "by_frames": by_frames,
         "by_hours": by_hours,
         "bars": charts.bar_sheet(finals, name="final_returns"),
-        "early": charts.early_sheet(groups, name="sample_efficiency"),
+        "early": charts.early_sheet(soon, joined, name="sample_efficiency"),
         "distance": distance,
         "logits": charts.logit_sheet(groups, name="logits"),
         "metrics": charts.metric_sheet(groups, name="metrics"),
@@ -59,7 +61,7 @@ def write_report(
         tables.final_table(finals),
         tables.aggregate_table(finals),
         tables.efficiency_table(groups),
-        tables.early_table(groups),
+        tables.early_table(joined, len(soon)),
         tables.seed_table(groups, num_seeds),
         tables.run_table(groups),
     ]

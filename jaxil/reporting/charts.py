@@ -1,14 +1,14 @@
 """Figures with panels by task: learning curves, last returns, what methods log."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from jaxil.reporting import figures, measures, plots
 from jaxil.reporting.groups import Group, expert_returns, tasks_of
-from jaxil.reporting.measures import Curve, Final
+from jaxil.reporting.measures import Curve, Early, Final
 from jaxil.reporting.sheets import Panel, Sheet
 from jaxil.reporting.statistics import Estimate
 
@@ -82,15 +82,19 @@ def bar_sheet(finals: Sequence[Final], *, name: str) -> Sheet | None:
     return _sheet(name, panels, [], caption)
 
 
-def early_sheet(groups: Sequence[Group], *, name: str) -> Sheet | None:
+def early_sheet(
+    tasks: Mapping[str, Sequence[Early]], joined: Sequence[Early], *, name: str
+) -> Sheet | None:
     """Plots how soon each group learns; None if no run is long enough.
 
-    With several tasks the first panel joins them, for variants that have all.
+    Args:
+      tasks: see `measures.early_by_task`.
+      joined: see `measures.early_over_tasks`; the first panel, unless it is empty.
+      name: of the files.
     """
-    found = measures.early_by_task(groups)
-    joined = measures.early_over_tasks(found)
+    found = dict(tasks)
     if joined:
-        found = {f"{len(found)} tasks together": joined, **found}
+        found = {f"{len(tasks)} tasks together": joined, **tasks}
     axis = "% of the expert's return, expert dashed"
     panels = []
     for title, shown in found.items():

@@ -13,11 +13,10 @@ from jaxil.reporting.measures import (
     EARLY_FRAMES,
     LEVELS,
     Curve,
+    Early,
     Final,
     arrivals,
     early,
-    early_by_task,
-    early_over_tasks,
 )
 from jaxil.reporting.statistics import Estimate
 
@@ -215,12 +214,11 @@ def efficiency_table(groups: Sequence[Group]) -> Table:
     return Table("sample_efficiency", "Sample efficiency", rows, about)
 
 
-def early_table(groups: Sequence[Group]) -> Table:
-    """Returns how soon each variant learns, over the tasks that have such runs."""
-    tasks = early_by_task(groups)
+def early_table(joined: Sequence[Early], num_tasks: int) -> Table:
+    """Returns how soon each variant learns over all tasks; see `early_over_tasks`."""
     rows = []
-    for each in early_over_tasks(tasks):
-        row = {"variant": each.group.label, "tasks": len(tasks)}
+    for each in joined:
+        row = {"variant": each.group.label, "tasks": num_tasks}
         row |= {"runs": len(each.shares), **_interval(_EARLY, each.iqm)}
         rows.append(row)
     about = (

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxil.reporting import charts, groups, runs, tables
+from jaxil.reporting import charts, groups, measures, runs, tables
 from tests.reporting.run_folders import write_run
 
 
@@ -15,18 +15,19 @@ def test_how_soon_methods_learn_is_joined_over_the_tasks_that_they_share(tmp_pat
     write_run(tmp_path / "e", "psil", "walker_walk", 0, {90_000: 1000})  # too short
     made = groups.make_groups(map(runs.read, runs.find([tmp_path])))
 
-    (row,) = tables.early_table(made).rows
+    tasks = measures.early_by_task(made)
+    joined = measures.early_over_tasks(tasks)
+    (row,) = tables.early_table(joined, len(tasks)).rows
     shown = {key: row[key] for key in ("variant", "tasks", "runs")}
     assert shown == {"variant": "P-DAC", "tasks": 2, "runs": 3}
     # Of 0.1, 0.4 and 0.5; with the bootstrap's 0.4 or 0.5 twice at its ends.
     ends = [row[f"share_to_100k{end}"] for end in ("", "_low", "_high")]
     np.testing.assert_allclose(ends, [1 / 3, 0.3, 1.1 / 3])
 
-    sheet = charts.early_sheet(made, name="sample_efficiency")
+    sheet = charts.early_sheet(tasks, joined, name="sample_efficiency")
     assert sheet is not None
     titles = [panel.title for panel in sheet.panels]
     assert titles == ["2 tasks together", "cartpole_swingup", "walker_walk"]
-    one = [group for group in made if group.task == "walker_walk"]
-    assert not tables.early_table(one).rows  # nothing to join
-    none = [group for group in one if group.label == "P-SIL"]
-    assert charts.early_sheet(none, name="sample_efficiency") is None
+    one = {"walker_walk": tasks["walker_walk"]}
+    assert not measures.early_over_tasks(one)  # nothing to join
+    assert charts.early_sheet({}, [], name="sample_efficiency") is None
