@@ -5,6 +5,7 @@ import json
 import os
 
 import jax
+import numpy as np
 import pytest
 
 from jaxil import benchmark, command
@@ -144,6 +145,19 @@ def test_a_full_replay_is_full(tmp_path):
         frames, seconds, working = bench.loop(6, waits=True)
         assert frames == 60
         assert 0 < working <= seconds
+
+
+def test_a_rewarder_observes_an_episode_before_it_learns(tmp_path):
+    config = jaxil_config.default_config("pdac", "cartpole_swingup")
+    config.update(image_size=24, hidden_dim=16, feature_dim=8, batch_size=4)
+    config.update(action_repeat=10, replay_size_steps=1000)
+    config.encoder.update(channels=(32,), kernel_sizes=(4,), strides=(4,))
+    config.demonstrations.num_episodes = 1
+    # Principal components of frames are NaN before the first episode.
+    config.discriminator.update(batch_size=4, hidden_dim=16, num_components=4)
+    with contextlib.closing(Bench(config, tmp_path, print)) as bench:
+        bench.update()
+        assert np.all(np.isfinite(bench.run.reward(bench.episode)))
 
 
 @pytest.mark.parametrize(

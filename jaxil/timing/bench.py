@@ -70,6 +70,7 @@ class Bench:
         self._rng = np.random.default_rng(0)
         self.episode = self._random_episode()
         self.observation = self._environment.reset(episode=0).observation
+        run.reward(self.episode)  # a rewarder may have to observe one before it learns
         self.add_episode()
         self.batches = self.sample()
         # A run may dispatch several updates at once.
