@@ -61,9 +61,10 @@ def q_filter(label_values: Array, policy_values: Array) -> Array:
 def trusted_cloning_loss(action: Array, label: Array, trust: Array) -> Array:
     """Returns the mean squared distance of the policy from labels, weighted by trust.
 
-        L = mean_b w_b |pi(e_b) - label_b|^2
+        L = mean_b w_b mean_a (pi(e_b) - label_b)_a^2
 
-    The mean is over all samples, so the term fades where few labels are trusted.
+    The mean is over all samples, so the term fades where few labels are trusted, and
+    over the action's numbers, so it is at most 4.
 
     Args:
       action: the policy's mean action. Shape [B, A].
@@ -71,13 +72,13 @@ def trusted_cloning_loss(action: Array, label: Array, trust: Array) -> Array:
       trust: w, in [0, 1], without gradient. Shape [B].
 
     Source: the cloning term of TD3+BC, Fujimoto and Gu 2021, arXiv:2106.06860, with
-    trust.
+    trust; the mean over the action is that of their code (sfujim/TD3_BC).
     """
     chex.assert_rank([action, label, trust], [2, 2, 1])
     chex.assert_equal_shape([action, label])
     chex.assert_equal_shape([action[:, 0], trust])
     label, trust = jax.lax.stop_gradient((label, trust))
-    return jnp.mean(trust * jnp.sum(jnp.square(action - label), axis=1))
+    return jnp.mean(trust * jnp.mean(jnp.square(action - label), axis=1))
 
 
 def value_scale(values: Array) -> Array:
@@ -85,8 +86,8 @@ def value_scale(values: Array) -> Array:
 
         s = mean_b |min_k Q_k(o_b, a_b)|
 
-    Multiplied by it, a term keeps its share of the actor's loss whatever the scale of
-    the rewards.
+    Multiplied by it, a term keeps its share of the actor's loss if all rewards are
+    multiplied by a number. If a number is added to them, it does not.
 
     Source: TD3+BC, Fujimoto and Gu 2021, arXiv:2106.06860, which divides the other term
     by it.

@@ -188,6 +188,8 @@ def make_update_step(
       the loss of prototypes, prediction and decoder train the encoder too, and the
       prediction could shrink its own targets to a constant. The targets are therefore a
       slow copy's features in standard deviations: see `losses.prediction_loss`.
+    - Its encoder is frozen after the first stage, and latent actions and policy share
+      it. Here the actor has the agent's own encoder, which cloning trains.
     - Its policy outputs latent actions, which the decoder translates. Here the actor
       regresses the decoded actions directly.
     - It moves codes to a moving average of their latents. Here `codebook_loss` does.

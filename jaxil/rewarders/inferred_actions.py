@@ -70,10 +70,10 @@ def with_cloning(
     """Returns a rewarder with the same rewards; its actor also clones inferred actions.
 
         min_g   mean_m mean_t |g_m(o_t, o_{t+1}) - a_t|^2      over the agent's samples
-        L_actor = ... + weight s mean_t w_t |pi(e_t) - mean_m g_m(e_t, e_{t+1})|^2
+        L_actor = ... + weight s mean_t w_t mean_a (pi(e_t) - label_t)_a^2
+        label_t = mean_m g_m(e_t, e_{t+1})
 
-    with the trust w in a label and s = mean |Q| of the agent's samples, without
-    gradient, so that the term's share does not depend on the scale of rewards. The
+    with the trust w in a label and s = `cloning.value_scale` of the agent's samples. The
     inverse models have an encoder of their own. The expert's actions are not read here,
     but the inner method may read them.
 

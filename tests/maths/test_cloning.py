@@ -38,15 +38,15 @@ def test_the_loss_weights_squared_distances_and_averages_over_all():
     action = jnp.array([[0.0, 0.0], [1.0, 0.0], [0.5, 0.5]])
     label = jnp.array([[1.0, 1.0], [0.0, 0.0], [-0.5, 0.5]])
     trust = jnp.array([0.5, 1.0, 0.0])
-    # (0.5 * 2 + 1 * 1 + 0 * 1) / 3
+    # (0.5 * (1 + 1) / 2 + 1 * (1 + 0) / 2 + 0 * (1 + 0) / 2) / 3
     loss = cloning.trusted_cloning_loss(action, label, trust)
-    np.testing.assert_allclose(loss, 2.0 / 3.0, rtol=1e-6)
+    np.testing.assert_allclose(loss, 1.0 / 3.0, rtol=1e-6)
 
 
 def test_only_the_policy_is_differentiated():
     action, label, trust = jnp.zeros((1, 2)), jnp.array([[1.0, 0.5]]), jnp.ones(1)
     gradients = jax.grad(cloning.trusted_cloning_loss, (0, 1, 2))(action, label, trust)
-    np.testing.assert_allclose(gradients[0], [[-2.0, -1.0]])
+    np.testing.assert_allclose(gradients[0], [[-1.0, -0.5]])
     assert not np.any(gradients[1])
     assert not np.any(gradients[2])
 

@@ -70,7 +70,7 @@ def make_term(trust, models=None, **changes):
     )
     parts = {
         "inferred": np.asarray(inferred),
-        "squares": np.sum((np.asarray(policy) - np.asarray(label)) ** 2, axis=1),
+        "squares": np.mean((np.asarray(policy) - np.asarray(label)) ** 2, axis=1),
         "scale": np.mean(np.abs(np.min(taken, axis=0))),
         "prefers": better > chosen,
     }
