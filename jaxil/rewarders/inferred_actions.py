@@ -73,9 +73,9 @@ def with_cloning(
         L_actor = ... + weight s mean_t w_t mean_a (pi(e_t) - label_t)_a^2
         label_t = mean_m g_m(e_t, e_{t+1})
 
-    with the trust w in a label and s = `cloning.value_scale` of the agent's samples. The
-    inverse models have an encoder of their own. The expert's actions are not read here,
-    but the inner method may read them.
+    with the trust w in a label and s = `cloning.value_scale` of the agent's samples.
+    The inverse models have an encoder of their own. The expert's actions are not read
+    here, but the inner method may read them.
 
     An update gets as many expert samples as the inner method asks for, or `num_pairs`
     if that is more; each uses the first rows. The inner method is given the random
