@@ -17,7 +17,8 @@ shadows. Other deviations from the paper:
 - Exploration ends sooner, the agent updates every step and learning rates are higher,
   since runs have to be short, and sooner still on finger_spin: training returns at 60k
   frames on state vectors were 292 with one seed, and 175, 122 and 262 with the preset's
-  usual length. In P-DAC's short runs on the cup it ends after 20k frames.
+  usual length. In P-DAC's short runs on the cup it ends after 20k frames. BCO and
+  BCV-LR play with noise of 0.5 throughout.
 - The replay is smaller, so that its rewards are newer, and they are recomputed
   (`reward_refresh_steps`): those of the first episodes come from an untrained
   discriminator and would teach the critic that random behaviour is best.
@@ -112,6 +113,8 @@ _SECTIONS = {
 # These have a separate encoder, and penalties need its second derivatives: with 64, an
 # update of DAC takes five times as long.
 _DISCRIMINATOR_BATCHES = {"dac": 16, "sil": 16, "gaifo": 16, "patchail": 8}
+# Inverse models need diverse play, so these explore to the end, as BCV-LR's authors do.
+_BY_PLAY = dict.fromkeys(("exploration_std_start", "exploration_std_end"), 0.5)
 
 
 def _falling(learning_rate_steps: int) -> dict[str, Any]:
@@ -183,6 +186,8 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
         section.update({k: value for k, value in fields.items() if k in section})
     if method in _DISCRIMINATOR_BATCHES:
         config.discriminator.batch_size = _DISCRIMINATOR_BATCHES[method]
+    if method in ("bco", "bcvlr"):
+        config.update(_BY_PLAY)
     config.update(_TASKS.get(task, {}))
     config.update(_REWARDERS.get((rewarder, task), {}))
     if (method, task) == ("pdac", "ball_in_cup_catch"):
