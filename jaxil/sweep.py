@@ -180,7 +180,8 @@ def _define(values: flags.FlagValues) -> None:
     studies = ", ".join(figures.studies())
     methods = "methods, or package.module:METHOD; comma separated"
     define(flags.DEFINE_list, "methods", [], methods)
-    define(flags.DEFINE_list, "ablation", [], f"variants of {studies}")
+    ablations = f"variants of {studies}; beside the runs of --methods"
+    define(flags.DEFINE_list, "ablation", [], ablations)
     define(flags.DEFINE_list, "tasks", list(figures.TASKS), "tasks, comma separated")
     define(number, "seeds", 10, "number of seeds")
     define(text, "preset", "paper", "paper, or tiny for CPU cores")
