@@ -86,6 +86,16 @@ def test_damaged_runs_do_not_end_the_report_of_the_others(tmp_path):
     assert "\nwalker_walk,P-DAC," in returns
 
 
+def test_a_report_of_runs_whose_hours_are_unknown(tmp_path):
+    folder = write_run(tmp_path / "runs", "pdac", "walker_walk", 0, {1000: 10})
+    text = "frame,task_return_mean\n1000,10\n"
+    (folder / "eval.csv").write_text(text)
+    report.main(["report", str(tmp_path / "runs"), f"--output={tmp_path}/out"])
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert "P-DAC" in page
+    assert "By hours" not in page
+
+
 def test_an_interrupted_report_leaves_the_old_one(tmp_path, monkeypatch):
     write_run(tmp_path / "runs", "drqv2", "walker_walk", 0, None)
     arguments = ["report", str(tmp_path / "runs"), f"--output={tmp_path}/out"]

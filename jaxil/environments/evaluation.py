@@ -14,7 +14,7 @@ Act = Callable[[np.ndarray], np.ndarray]  # observation -> action [A]
 class Evaluation(NamedTuple):
     """E episodes of one policy."""
 
-    episodes: list[Episode]  # with the task's rewards
+    episodes: list[Episode]  # the first `num_kept`, with the task's rewards
     task_returns: np.ndarray  # undiscounted. Shape [E]
     recorded: list[Any]  # what `record` returned, [T + 1]; else empty
 
@@ -39,6 +39,7 @@ def evaluate(
     *,
     num_episodes: int,
     first_episode: int,
+    num_kept: int = 1,
     record: Callable[[], Any] | None = None,
     stop_asked: Callable[[], bool] = lambda: False,
 ) -> Evaluation:
@@ -49,22 +50,25 @@ def evaluate(
       act: the policy.
       num_episodes: at least 1.
       first_episode: number of the first episode; it determines the initial states.
+      num_kept: episodes of which the observations are kept.
       record: called at each moment of the first episode; None records nothing.
       stop_asked: called before each agent step; True raises `Stopped`.
     """
     player = Player(InProcess(environment), first_episode=first_episode)
-    episodes: list[Episode] = []
+    kept: list[Episode] = []
+    returns: list[float] = []
     recorded: list[Any] = []
-    while len(episodes) < num_episodes:
+    while len(returns) < num_episodes:
         if stop_asked():
             raise Stopped
         began = player.begin(lambda: True)
-        records = record if not episodes else None
+        records = record if not returns else None
         if records and began:
             recorded.append(records())
         player.step(np.asarray(act(player.observations[0]))[None])
-        episodes += player.observe()
+        for episode in player.observe():
+            returns.append(episode.rewards.sum(dtype=np.float64))
+            kept += [episode] if len(kept) < num_kept else []
         if records:
             recorded.append(records())
-    returns = [episode.rewards.sum(dtype=np.float64) for episode in episodes]
-    return Evaluation(episodes, np.asarray(returns), recorded)
+    return Evaluation(kept, np.asarray(returns), recorded)

@@ -1,5 +1,6 @@
 """Reads NumPy archives (.npz), even damaged or hostile ones; writes them atomically."""
 
+import contextlib
 import errno
 import io
 import math
@@ -9,7 +10,7 @@ import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -39,6 +40,50 @@ def member_names(path: pathlib.Path) -> frozenset[str]:
     return frozenset(name.removesuffix(".npy") for name in names)
 
 
+class Reader:
+    """Reads arrays of an open archive."""
+
+    def __init__(self, archive: zipfile.ZipFile, file_bytes: int) -> None:
+        """`file_bytes` is the length of its file."""
+        self._archive = archive
+        self._file_bytes = file_bytes
+        self._stored = {info.filename: info for info in archive.infolist()}
+
+    def read(self, max_bytes: Mapping[str, int]) -> dict[str, np.ndarray]:
+        """Returns arrays; arguments and errors as of `read_archive`."""
+        with _damages_reported():
+            missing = [name for name in max_bytes if f"{name}.npy" not in self._stored]
+            if missing:
+                raise ValueError(f"has no array {', '.join(missing)}")
+            members = {name: self._stored[f"{name}.npy"] for name in max_bytes}
+            for name, info in members.items():
+                _check_size(name, info, max_bytes[name], self._file_bytes)
+            num_bytes = sum(info.file_size for info in members.values())
+            budget = max(max_bytes.values(), default=0)
+            if num_bytes > budget:
+                raise ValueError(
+                    f"has arrays of {num_bytes} bytes in all ({', '.join(members)})"
+                    f", more than the {budget} allowed"
+                )
+            for name, info in members.items():
+                _check_header(self._archive, name, info)
+            return {k: _unpack(self._archive, info) for k, info in members.items()}
+
+
+@contextlib.contextmanager
+def opened(path: pathlib.Path) -> Iterator[Reader]:
+    """Opens an archive from which arrays are read one after another.
+
+    Raises:
+      OSError, ValueError: as `read_archive`.
+    """
+    with open_regular(path) as file:
+        with _damages_reported():
+            archive = zipfile.ZipFile(file)
+        with archive:
+            yield Reader(archive, os.fstat(file.fileno()).st_size)
+
+
 def read_archive(
     path: pathlib.Path, *, max_bytes: Mapping[str, int]
 ) -> dict[str, np.ndarray]:
@@ -54,35 +99,20 @@ def read_archive(
       ValueError: the file is damaged or too large; the message continues a sentence
         that begins with the file's name.
     """
-    budget, num_bytes = max(max_bytes.values(), default=0), 0
-    with open_regular(path) as file:
-        try:
-            with zipfile.ZipFile(file) as archive:
-                stored = {info.filename: info for info in archive.infolist()}
-                missing = [name for name in max_bytes if f"{name}.npy" not in stored]
-                if missing:
-                    raise ValueError(f"has no array {', '.join(missing)}")
-                members = {name: stored[f"{name}.npy"] for name in max_bytes}
-                file_bytes = os.fstat(file.fileno()).st_size
-                for name, info in members.items():
-                    _check_size(name, info, max_bytes[name], file_bytes)
-                    num_bytes += info.file_size
-                if num_bytes > budget:
-                    raise ValueError(
-                        f"has arrays of {num_bytes} bytes in all ({', '.join(members)})"
-                        f", more than the {budget} allowed"
-                    )
-                for name, info in members.items():
-                    _check_header(archive, name, info)
-                return {name: _unpack(archive, info) for name, info in members.items()}
-        except OSError as error:
-            if error.errno != errno.EINVAL:  # a seek to before the file's start
-                raise
-            raise ValueError("is cut off, damaged or no .npz file") from error
-        except _DAMAGES as error:
-            raise ValueError(
-                f"is cut off, damaged or no .npz file ({error})"
-            ) from error
+    with opened(path) as reader:
+        return reader.read(max_bytes)
+
+
+@contextlib.contextmanager
+def _damages_reported() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # a seek to before the file's start
+            raise
+        raise ValueError("is cut off, damaged or no .npz file") from error
+    except _DAMAGES as error:
+        raise ValueError(f"is cut off, damaged or no .npz file ({error})") from error
 
 
 def _check_size(name: str, info: zipfile.ZipInfo, limit: int, file_bytes: int) -> None:

@@ -1,16 +1,20 @@
 """CSV tables of numbers that survive a kill in mid-write."""
 
+import array
 import csv
 import io
 import math
 import os
 import pathlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from jaxil.files import untrusted, writing
+
+# The longest runs' tables have some megabytes.
+_MAX_BYTES = 2**26
 
 
 class CsvLog:
@@ -43,7 +47,8 @@ class CsvLog:
         if self._path.exists():
             name = self._path.name
             try:
-                rows = _read(self._path)[1]
+                names, lines = _read(self._path)
+                rows = [dict(zip(names, line)) for line in lines]
                 frames = [float(row["frame"]) for row in rows]
                 if resume_frame is None:
                     rows = []
@@ -95,28 +100,42 @@ def read_csv(path: str | os.PathLike) -> dict[str, np.ndarray]:
       ValueError: there is no header with "frame", or a cell is not a number.
     """
     columns, rows = _read(pathlib.Path(path))
-    try:
-        return {
-            column: np.array([float(row[column] or math.nan) for row in rows])
-            for column in columns
-        }
-    except ValueError as error:
-        raise ValueError(f"{path}: expected numbers only, {error}") from error
+    # Eight bytes a number: a table from elsewhere may have many rows.
+    values = [array.array("d") for _ in columns]
+    for row in rows:
+        for column, cell in zip(values, row):
+            try:
+                column.append(float(cell or math.nan))
+            except ValueError as error:
+                raise ValueError(f"{path}: expected numbers only, {error}") from error
+    return {name: np.array(column) for name, column in zip(columns, values)}
 
 
-def _read(path: pathlib.Path) -> tuple[list[str], list[dict[str, str]]]:
-    """Returns the names of the columns, and the rows."""
-    content = untrusted.read_regular(path)
+def _read(path: pathlib.Path) -> tuple[list[str], Iterator[list[str]]]:
+    """Returns the names of the columns, and the rows, each as long as these."""
+    content = untrusted.read_regular(path, _MAX_BYTES)
     try:
         # A kill in mid-write leaves a last line without a line end.
         text = content[: content.rfind(b"\n") + 1].decode()
-        columns, *rows = [*csv.reader(io.StringIO(text))] or [[]]
-        table = [dict(zip(columns, row, strict=True)) for row in rows if row]
+        rows = csv.reader(io.StringIO(text))
+        columns = next(rows, [])
     except (ValueError, csv.Error) as error:
         raise ValueError(f"{path}: expected a table, {error}") from error
     if "frame" not in columns:
         raise ValueError(f'{path}: expected a header line with "frame" in it')
-    return columns, table
+
+    def checked() -> Iterator[list[str]]:
+        try:
+            for row in filter(None, rows):
+                if len(row) != len(columns):
+                    raise csv.Error(
+                        f"line {rows.line_num} has {len(row)} cells, not {len(columns)}"
+                    )
+                yield row
+        except csv.Error as error:
+            raise ValueError(f"{path}: expected a table, {error}") from error
+
+    return columns, checked()
 
 
 def _set_aside(path: pathlib.Path, word: str) -> pathlib.Path:

@@ -194,7 +194,10 @@ def tasks_of(groups: Iterable[Group]) -> dict[str, list[Group]]:
 
 def _has(run: Run, field: str) -> bool:
     # An older run may lack a field that its method has today.
-    return field in run.config or field in jaxil_config.fields(run.variant.method)
+    method = run.variant.method
+    return field in run.config or (
+        figures.is_installed(method) and field in jaxil_config.fields(method)
+    )
 
 
 def _matters(run: Run, field: str) -> bool:

@@ -148,18 +148,20 @@ def arrivals(run: Run, x: str) -> list[float]:
     """Returns when a run first reached each of LEVELS of its expert; NaN for never.
 
     Args:
-      run: any; a run without demonstrations reaches none.
+      run: any; a run reaches none without an expert of positive return, of which there
+        would be no shares.
       x: "frame" or "hours".
     """
     position, returns = series(run.evaluation, x, "task_return_mean")
-    levels = [share * run.expert_return for share in LEVELS]
+    expert = run.expert_return if run.expert_return > 0 else float("nan")
+    levels = [share * expert for share in LEVELS]
     return [statistics.first_reaching(position, returns, level) for level in levels]
 
 
 def early_share(run: Run) -> float:
     """Returns a run's mean share of the expert's return up to EARLY_FRAMES.
 
-    NaN if it is shorter, or without demonstrations.
+    NaN if it is shorter, or without an expert of positive return.
     """
     frames, returns = series(run.evaluation, "frame", "task_return_mean")
     if not run.expert_return > 0:

@@ -119,12 +119,17 @@ def find(roots: Iterable[pathlib.Path]) -> list[pathlib.Path]:
     """Returns every folder of a run at or below `roots`, each one once.
 
     That is a folder with a config.json, or with the failed.json that a sweep writes for
-    a run that ended before it had one.
+    a run that ended before it had one. Links to folders are followed.
     """
     found: dict[pathlib.Path, pathlib.Path] = {}
     for root in roots:
-        for path, folders, files in os.walk(root):
+        seen = set()
+        for path, folders, files in os.walk(root, followlinks=True):
             folder = pathlib.Path(path)
+            if (place := os.path.realpath(path)) in seen:  # links may form a circle
+                folders.clear()
+                continue
+            seen.add(place)
             if "config.json" in files or _FAILED in files:
                 found.setdefault(folder.resolve(), folder)
                 folders[:] = [name for name in folders if name not in _OWN_FOLDERS]
@@ -150,7 +155,7 @@ def read(folder: pathlib.Path) -> Run:
         remarks.append(f"its method {name!r} is {why}")
         known = {name.split(".")[0] for name in config}
         own = {key: value for key, value in nested.items() if key not in known}
-        config |= flat(own)
+        config |= {key: value for key, value in flat(own).items() if _is_name(key)}
     if (folder / _FAILED).exists():
         remarks.append(f"failed, {_exit_status(folder)}; see its log")
     evaluation = _read_table(folder / "eval.csv", ("frame", _RETURN), remarks)
@@ -207,11 +212,13 @@ def _read_config(path: pathlib.Path) -> dict[str, Any]:
         value = config.get(field)
         if not isinstance(value, kind) or isinstance(value, bool):
             raise UnreadableError(f"has no {field} ({_shown(value)})")
-        if isinstance(value, str) and not (
-            value.isprintable() and 0 < len(value) <= _MAX_REASON
-        ):
+        if isinstance(value, str) and not _is_name(value):
             raise UnreadableError(f"has a damaged {field} ({_shown(value)})")
     return stored
+
+
+def _is_name(text: str) -> bool:
+    return text.isprintable() and 0 < len(text) <= _MAX_REASON
 
 
 def _exit_status(folder: pathlib.Path) -> str:

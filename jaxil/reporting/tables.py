@@ -191,11 +191,11 @@ def efficiency_table(groups: Sequence[Group]) -> Table:
             continue
         frames = [arrivals(run, "frame") for run in runs]
         hours = [arrivals(run, "hours") for run in runs]
-        has_expert = any(np.isfinite(run.expert_return) for run in runs)
+        has_shares = any(run.expert_return > 0 for run in runs)
         row = {"task": group.task, "variant": group.label, "runs": len(runs)}
         for k, percent in enumerate(_PERCENTS):
             reached = np.isfinite([each[k] for each in frames]).mean()
-            row[f"reached_{percent}"] = reached if has_expert else _NAN
+            row[f"reached_{percent}"] = reached if has_shares else _NAN
             for unit, times in (("frames", frames), ("hours", hours)):
                 median = statistics.median_arrival([each[k] for each in times])
                 row[f"{unit}_{percent}"] = median

@@ -12,7 +12,7 @@ from jaxil.learner.state import TrainState
 from jaxil.maths.types import Episode, ExpertEpisodes
 from jaxil.training import film
 from jaxil.training.agent import Agent
-from jaxil.training.expert_distance import ExpertDistance
+from jaxil.training.expert_distance import MAX_EPISODES, ExpertDistance
 
 _STRIP_FRAMES = 10
 
@@ -87,6 +87,7 @@ class Evaluator:
                 act,
                 num_episodes=config.num_eval_episodes,
                 first_episode=first_episode,
+                num_kept=1 if self._distance is None else MAX_EPISODES,
                 record=film.recorder(self.environment, film.SIZE) if films else None,
                 stop_asked=stop_asked,
             )

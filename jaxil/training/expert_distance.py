@@ -34,7 +34,7 @@ _EPSILON, _NUM_ITERATIONS = 0.01, 100  # as P-SIL's; see `jaxil/methods.py`
 _FEATURE_DIM, _STATE_DIM = 50, 256
 # Moments of an episode that are compared, evenly spaced, and episodes of one side:
 # the cost matrix is [640, 640] at most.
-_MOMENTS, _MAX_EPISODES = 64, 10
+_MOMENTS, MAX_EPISODES = 64, 10
 _LAYERS = ((3, 2), (3, 1), (3, 1), (3, 1))  # kernel and stride, as DrQ-v2's
 # Stored with a random policy's distance, which is measured again if this has changed.
 _DEFINITION = "debiased Sinkhorn divergence of 64 moments an episode"
@@ -88,7 +88,7 @@ class ExpertDistance:
         return float(_divergence(agent, self._expert))
 
     def _embed_all(self, episodes: list[np.ndarray]) -> Array:
-        return jnp.concatenate([self._embed(each) for each in episodes[:_MAX_EPISODES]])
+        return jnp.concatenate([self._embed(each) for each in episodes[:MAX_EPISODES]])
 
     def _of_random_policy(self) -> float:
         stored = _read(self._path)
@@ -102,6 +102,7 @@ class ExpertDistance:
             lambda _: rng.uniform(-1.0, 1.0, shape),
             num_episodes=_RANDOM_EPISODES,
             first_episode=0,
+            num_kept=_RANDOM_EPISODES,
         )
         environment.close()
         # It may be zero where the expert acts at random too.

@@ -11,6 +11,7 @@ from jaxil.demonstrations.readers.recording import (
     checked_episode,
 )
 from jaxil.demonstrations.states import DemonstrationError
+from jaxil.files import archive
 from tests.demonstrations.pixel_files import (
     LIMIT,
     TASK,
@@ -122,3 +123,22 @@ def test_text_of_a_file_is_made_harmless(path):
             load(path)
         assert len(str(caught.value)) < 2000
         assert not {"\x1b", "\x07", "\u202e"} & set(str(caught.value))
+
+
+def test_a_file_is_opened_as_often_for_many_episodes_as_for_few(path, monkeypatch):
+    opened = []
+    original = archive.open_regular
+
+    def spy(*arguments):
+        opened.append(arguments)
+        return original(*arguments)
+
+    monkeypatch.setattr(archive, "open_regular", spy)
+    counts = []
+    for number in (2, 30):
+        write(path, [make_episode()] * number)
+        opened.clear()
+        recording = foreign.open_recording(path, max_bytes=LIMIT)
+        assert sum(1 for _ in recording.episodes) == number
+        counts.append(len(opened))
+    assert counts[0] == counts[1]

@@ -1,5 +1,7 @@
 """Tables that survive kills, and those that did not."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -55,6 +57,19 @@ def test_a_row_cut_off_by_a_kill_is_dropped(tmp_path):
     np.testing.assert_array_equal(read_csv(path)["frame"], [10, 20])
     write_rows(path, [40], resume_frame=1000)
     np.testing.assert_array_equal(read_csv(path)["frame"], [10, 20, 40])
+
+
+def test_a_long_table_from_elsewhere_takes_little_memory(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("frame,a\n" + "1,1\n" * 300_000)
+    tracemalloc.start()
+    assert len(read_csv(path)["a"]) == 300_000
+    assert tracemalloc.get_traced_memory()[1] < 40e6
+    tracemalloc.stop()
+    with path.open("a") as file:
+        file.truncate(2**26 + 1)
+    with pytest.raises(ValueError, match="at most"):
+        read_csv(path)
 
 
 def test_without_a_frame_to_resume_from_the_table_begins_anew(tmp_path):

@@ -34,6 +34,14 @@ def test_every_run_is_found_once(found, tmp_path):
     assert runs.find([tmp_path, inner, tmp_path / "a"]) == [inner]
 
 
+def test_linked_runs_are_found_and_circles_of_links_end(tmp_path):
+    elsewhere = write_run(tmp_path / "far" / "run", "pdac", "walker_walk", 0, {})
+    (tmp_path / "near").mkdir()
+    (tmp_path / "near" / "linked").symlink_to(elsewhere)
+    (tmp_path / "near" / "back").symlink_to(tmp_path / "near")
+    assert runs.find([tmp_path / "near"]) == [tmp_path / "near" / "linked"]
+
+
 def test_states(found):
     def state(name):
         return found[f"walker_walk/{name}"].state
@@ -291,6 +299,30 @@ def test_a_run_whose_method_is_not_installed_is_shown(tmp_path):
     ]
 
 
+def test_code_that_only_folders_name_is_not_run(tmp_path, monkeypatch):
+    (tmp_path / "evil_method.py").write_text("raise SystemExit('it was run')")
+    monkeypatch.syspath_prepend(tmp_path)
+    shown = []
+    for seed, own in enumerate(({"size": 1, "rate": 2}, {"size": 2})):
+        folder = write_run(tmp_path / str(seed), "pdac", "walker_walk", seed, {1000: 1})
+        stored = json.loads((folder / "config.json").read_text())
+        stored["config"] |= {"method": "evil_method:METHOD", "own": own}
+        (folder / "config.json").write_text(json.dumps(stored))
+        shown.append(runs.read(folder))
+    labels = [group.label for group in groups.make_groups(shown)]
+    assert labels == [f"evil_method:METHOD (own.size {size})" for size in (1, 2)]
+
+
+def test_names_of_unknown_fields_that_no_page_can_hold_are_left_out(tmp_path):
+    folder = write_run(tmp_path / "run", "pdac", "walker_walk", 0, {1000: 1})
+    stored = json.loads((folder / "config.json").read_text())
+    own = {"fine": 1, "\x1b[31m": 2, "long" * 1000: 3}
+    stored["config"] |= {"method": "gone.away:METHOD", "own": own}
+    (folder / "config.json").write_text(json.dumps(stored))
+    config = runs.read(folder).config
+    assert [name for name in config if name.startswith("own.")] == ["own.fine"]
+
+
 def test_unusual_runs_and_limited_comparisons_are_reported(found):
     read = [run for run in found.values() if not isinstance(run, str)]
     made = groups.make_groups(read)
@@ -341,3 +373,14 @@ def test_sample_efficiency_up_to_100000_frames(tmp_path):
     # 0.4375 and half of it; the third run is too short to count.
     assert row["share_to_100k"] == pytest.approx(0.328125)
     assert row["share_to_100k_low"] < row["share_to_100k"] < row["share_to_100k_high"]
+
+
+@pytest.mark.parametrize("expert", [-150.0, 0.0, ""])
+def test_there_are_no_shares_of_an_expert_without_positive_return(tmp_path, expert):
+    returns = {1000: -150, 150_000: -60}
+    write_run(tmp_path / "run", "psil", "walker_walk", 0, returns, expert=expert)
+    (row,) = tables.efficiency_table(
+        groups.make_groups(map(runs.read, runs.find([tmp_path])))
+    ).rows
+    shares = ("reached_50", "reached_90", "frames_50", "hours_90", "share_to_100k")
+    assert np.isnan([row[name] for name in shares]).all()

@@ -75,14 +75,13 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
         origin=metadata["origin"],
         **{name: metadata[name] for name in _OPTIONAL},
     )
-    for index in range(num_episodes):
-        names = {name: f"{name}_{index}" for name in ("frames", "actions", "rewards")}
-        names = {k: v for k, v in names.items() if k == "frames" or v in stored}
-        limits = dict.fromkeys(names.values(), options.max_bytes)
-        with naming(path, path):
-            arrays = archive.read_archive(path, max_bytes=limits)
-        known = {name: arrays[names[name]] for name in names}
-        yield PixelEpisode(stored_size=None, **known)
+    with naming(path, path), archive.opened(path) as reader:
+        for index in range(num_episodes):
+            names = {k: f"{k}_{index}" for k in ("frames", "actions", "rewards")}
+            names = {k: v for k, v in names.items() if k == "frames" or v in stored}
+            arrays = reader.read(dict.fromkeys(names.values(), options.max_bytes))
+            known = {name: arrays[names[name]] for name in names}
+            yield PixelEpisode(stored_size=None, **known)
 
 
 def _read_metadata(path: pathlib.Path) -> dict[str, Any]:
