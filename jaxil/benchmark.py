@@ -20,7 +20,7 @@ from absl import flags
 from jaxil import command
 from jaxil.errors import UsageError, unknown_name
 from jaxil.files.settings import flat
-from jaxil.files.writing import obstacle
+from jaxil.files.writing import obstacle, wrong_name
 
 _EXAMPLE = "such as --sweep=batch_size:64,128,256"
 
@@ -101,7 +101,8 @@ def _flag_problems(values: flags.FlagValues) -> list[str]:
         faults.append("--sweep and --compare cannot be combined; leave one out")
     if values.json is not None:
         path = pathlib.Path(values.json)
-        if path.is_dir() or not path.parent.is_dir() or obstacle(path.parent):
+        is_place = os.path.isdir(path.parent) and not os.path.isdir(path)
+        if not is_place or wrong_name(path) or obstacle(path.parent):
             faults.append(_unwritable(values.json))
     return faults
 

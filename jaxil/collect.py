@@ -24,20 +24,18 @@ Minari and LeRobot v3 datasets.
 
 import contextlib
 import functools
+import os
 import pathlib
 import sys
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Iterator
 
 from absl import flags
 
 from jaxil import command
 from jaxil.config import FIELDS
-from jaxil.errors import UsageError, unknown_name
-from jaxil.files.writing import obstacle
+from jaxil.errors import UsageError
+from jaxil.files.writing import obstacle, wrong_name
 
-_NUM_EVAL_EPISODES = 10
-_SEED = 777  # of the recording environment; no training or evaluation uses it
 _INSPECTED_SIZE, _CONVERTED_SIZE = 160, 84  # of images rendered from states
 # What each job reads; all but --inspect need an output.
 _JOBS = {
@@ -46,6 +44,7 @@ _JOBS = {
     "inspect": ("image_size", "render_quality", "camera", "frame_skip"),
     "convert": ("image_size", "render_quality", "camera", "frame_skip", "fit"),
 }
+_OF_PIXELS = ("camera", "frame_skip", "fit")
 
 
 def main(argv: list[str]) -> None:
@@ -69,114 +68,42 @@ def _problems(values: flags.FlagValues) -> list[str]:
         faults = [f"exactly one of {names} is required; given: {given}"]
         return faults + _output_faults(values)
     read = (*jobs, "output", *_JOBS[jobs[0]])
-    unread = [name for name in values if values[name].present and name not in read]
-    faults = [f"--{name} is not for --{jobs[0]}: leave it out" for name in unread]
+    present = [name for name in values if values[name].present]
+    faults = [
+        f"--{name} is not for --{jobs[0]}: leave it out"
+        for name in present
+        if name not in read
+    ]
+    source = values.inspect or values.convert
+    if source and _holds_states(source):
+        faults += [
+            f"--{name} is for pixels, but {source} holds simulator states: leave it out"
+            for name in present
+            if name in _OF_PIXELS and name in read
+        ]
     if values.policy and not values.task:
         faults.append("--task is missing: name the policy's task")
     return faults + _output_faults(values)
 
 
 def _record(values: flags.FlagValues) -> None:
-    import numpy as np
+    from jaxil import record
 
-    from jaxil.environments.evaluation import evaluate
-    from jaxil.training import assembly, trained
-
-    loaded = [trained.load(pathlib.Path(folder)) for folder in values.workdirs]
-    tasks = sorted({policy.config.task for policy, _ in loaded})
-    if len(tasks) > 1:
-        raise UsageError(
-            f"--workdirs hold runs of different tasks ({', '.join(tasks)}); list runs "
-            "of one task"
-        )
-    means = []
-    print(f"{'mean':>8}{'std':>8}{'frames':>10}{'minutes':>9}  run")
-    for folder, (policy, environment) in zip(values.workdirs, loaded, strict=True):
-        with environment:
-            evaluation = evaluate(
-                environment, policy, num_episodes=_NUM_EVAL_EPISODES, first_episode=0
-            )
-        means.append(evaluation.mean)
-        print(
-            f"{evaluation.mean:>8.1f}{evaluation.std:>8.1f}{policy.frame:>10}"
-            f"{policy.seconds / 60:>9.0f}  {folder}",
-            flush=True,
-        )
-    best, _ = loaded[int(np.argmax(means))]
-    with assembly.environment_with_seed(best.config, _SEED) as environment:
-        _write(
-            values,
-            environment,
-            best,
-            task=best.config.task,
-            action_repeat=best.config.action_repeat,
-            expert=f"{best.description()}; mean action, no noise",
-        )
+    folders = [pathlib.Path(folder) for folder in values.workdirs]
+    output = pathlib.Path(values.output)
+    record.best_of_runs(folders, output, num_episodes=values.num_episodes)
 
 
 def _record_policy(values: flags.FlagValues) -> None:
-    from jaxil import outside
-    from jaxil.environments import suite, tasks
+    from jaxil import record
 
-    known = suite.known_tasks()
-    if tasks.is_of_suite(values.task) and values.task not in known:
-        raise UsageError(unknown_name("--task", values.task, known))
-    act = outside.load(values.policy, "--policy")
-    settings = {"seed": _SEED, "action_repeat": values.action_repeat}
-    try:
-        environment = tasks.make_recorded(
-            values.task, image_size=values.image_size, **settings
-        )
-    except ValueError as error:
-        raise UsageError(f"--task={values.task}: {error}") from error
-    try:
-        with environment:
-            _write(
-                values,
-                environment,
-                act,
-                task=values.task,
-                action_repeat=values.action_repeat,
-                expert=values.policy,
-            )
-    except ValueError as error:
-        raise UsageError(f"--policy={values.policy}: {error}") from error
-
-
-def _write(
-    values: flags.FlagValues,
-    environment: Any,
-    act: Callable[[Any], Any],
-    *,
-    task: str,
-    action_repeat: int,
-    expert: str,
-) -> None:
-    """Records episodes and prints what they return."""
-    import numpy as np
-
-    from jaxil.demonstrations import from_policy, states
-    from jaxil.machine import screen
-
-    output = pathlib.Path(values.output)
-    try:
-        returns = from_policy.record(
-            output,
-            environment,
-            act,
-            num_episodes=values.num_episodes,
-            task=task,
-            action_repeat=action_repeat,
-            seed=_SEED,
-            expert=expert,
-            say=screen.say,
-        )
-    except (OSError, states.DemonstrationError) as error:
-        raise UsageError(f"--output={output}: {error}") from error
-    print(
-        f"{output}: {len(returns)} episodes of {expert}, return mean "
-        f"{np.mean(returns):.1f}, minimum {min(returns):.1f}, maximum "
-        f"{max(returns):.1f}, {output.stat().st_size / 1e6:.2f} MB"
+    record.policy(
+        values.policy,
+        pathlib.Path(values.output),
+        task=values.task,
+        action_repeat=values.action_repeat,
+        image_size=values.image_size,
+        num_episodes=values.num_episodes,
     )
 
 
@@ -261,18 +188,28 @@ def _reported(path: pathlib.Path | str, flags_given: str) -> Iterator[None]:
         ) from error
 
 
+def _holds_states(source: str) -> bool:
+    from jaxil.demonstrations import states
+
+    try:
+        return states.recognises(states.located(source))
+    except states.DemonstrationError:
+        return False
+
+
 def _output_faults(values: flags.FlagValues) -> list[str]:
     """Returns faults of --output that would otherwise show only after minutes."""
     if values.output is None:
         return [] if values.inspect else ["--output=NAME.npz is missing"]
     output = pathlib.Path(values.output)
-    if values.inspect and output.exists() and not output.is_dir():
+    is_folder = os.path.isdir(output)
+    if values.inspect and os.path.exists(output) and not is_folder:
         return [f"--output={output} must be a folder"]
-    if output.is_dir() and not values.inspect:
+    if is_folder and not values.inspect:
         return [f"--output={output} is a folder: name a file, NAME.npz"]
-    if values.convert and output.resolve() == pathlib.Path(values.convert).resolve():
+    if values.convert and os.path.realpath(output) == os.path.realpath(values.convert):
         return [f"--output={output} is the file to convert: name another one"]
-    why = obstacle(output if values.inspect else output.parent)
+    why = wrong_name(output) or obstacle(output if values.inspect else output.parent)
     return [f"--output={output} cannot be written ({why}): name another"] if why else []
 
 

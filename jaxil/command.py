@@ -7,6 +7,7 @@ interrupted; 1 otherwise.
 import ast
 import importlib.machinery
 import importlib.util
+import io
 import os
 import pathlib
 import sys
@@ -62,7 +63,7 @@ def parse(
         else:
             try:
                 values([argv[0], word])
-            except flags.Error as error:
+            except (flags.Error, ValueError) as error:  # the latter of --noNAME=VALUE
                 reason = str(error).split(": ", 1)[-1]
                 faults.append(Fault(f"--{name}", f"is wrong: {reason}"))
     values.mark_as_parsed()
@@ -104,6 +105,8 @@ def run(main: Callable[[list[str]], int | None]) -> None:
     Args:
       main: takes `sys.argv`; returns the status, None for 0.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):  # paths need not be UTF-8
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         status = main(sys.argv) or 0
     except UsageError as error:
@@ -233,9 +236,10 @@ def _config_of_file(value: str) -> Config:
     """Runs get_config of FILE.py[:ARGUMENT], or of a preset, NAME[:ARGUMENT]."""
     name, colon, argument = value.partition(":")
     path = pathlib.Path(name)
-    if path.suffix != ".py" and not path.is_file():
+    is_file = os.path.isfile(path)
+    if path.suffix != ".py" and not is_file:
         return presets.get_config(name, argument if colon else None).unlock()
-    if not path.is_file():
+    if not is_file:
         raise UsageError(
             Fault(
                 "--config",
@@ -264,7 +268,12 @@ def _config_of_file(value: str) -> Config:
         rule = "has a get_config() that does not return a ConfigDict"
         raise UsageError(Fault("--config", rule, value=value))
     there = flat(config.to_dict())
-    known = tuple(jaxil_config.fields(there.get("method", "pdac")))
+    method = there.get("method", "pdac")
+    is_text = isinstance(method, str)
+    fields = jaxil_config.fields(method) if is_text else jaxil_config.FIELDS
+    if wrong := declarations.type_problems(fields, there):
+        raise UsageError(wrong)
+    known = tuple(fields)
     lacking = [name for name in known if name not in there]
     if lacking:
         rule = f"has a get_config() that leaves out {', '.join(lacking[:3])}"

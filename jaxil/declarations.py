@@ -119,9 +119,8 @@ def problems(method: Method) -> Iterator[str]:
 
 def field_problems(name: str, field: Field, value: Any) -> Iterator[Fault]:
     """Yields why a field cannot have a value: its type, its choices or its range."""
-    kind = type(field.default)
-    if not _has_type(value, kind):
-        yield Fault(name, f"must be {KINDS[kind]}", field.about, value)
+    if fault := type_problem(name, field, value):
+        yield fault
     elif field.choices:
         if value not in field.choices:
             yield unknown_name(name, value, field.choices)
@@ -134,11 +133,26 @@ def field_problems(name: str, field: Field, value: Any) -> Iterator[Fault]:
             yield Fault(name, f"must lie in {interval}", field.about, value)
 
 
-def _has_type(value: Any, kind: type) -> bool:
-    """Returns whether a value can stand where a default of that type does."""
+def type_problems(
+    fields: Mapping[str, Field], values: Mapping[str, Any]
+) -> list[Fault]:
+    """Returns why values, by field, cannot stand where the defaults do."""
+    found = [
+        type_problem(name, field, values[name])
+        for name, field in fields.items()
+        if name in values
+    ]
+    return list(filter(None, found))
+
+
+def type_problem(name: str, field: Field, value: Any) -> Fault | None:
+    """Returns why a value cannot stand where a field's default does."""
+    kind = type(field.default)
     if kind is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    return isinstance(value, list if kind is tuple else kind) or type(value) is kind
+        fits = isinstance(value, int | float) and not isinstance(value, bool)
+    else:
+        fits = isinstance(value, list if kind is tuple else kind) or type(value) is kind
+    return None if fits else Fault(name, f"must be {KINDS[kind]}", field.about, value)
 
 
 def _plain_problems(method: Method) -> Iterator[str]:

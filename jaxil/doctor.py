@@ -84,12 +84,17 @@ def versions(_: Any) -> Iterator[Finding]:
     yield Finding("ok", "packages", ", ".join(good))
 
 
-def gl_libraries(_: Any) -> Iterator[Finding]:
+def gl_libraries(config: Any) -> Iterator[Finding]:
     """Looks for the libraries that render without a display."""
     found = {name: ctypes.util.find_library(name) for name in ("EGL", "OSMesa", "GL")}
     value = ", ".join(f"{name} {path or 'missing'}" for name, path in found.items())
     advice = "" if found["EGL"] or found["OSMesa"] else _GL_INSTALL
-    yield _judged("GL libraries", value, advice, "fault")
+    yield _judged("GL libraries", value, advice, _without_gl(config))
+
+
+def _without_gl(config: Any) -> str:
+    """Returns how bad it is that nothing renders: a run on states has no video."""
+    return "fault" if config is None or config.observation == "pixels" else "warning"
 
 
 def jax_devices(_: Any) -> Iterator[Finding]:
@@ -125,7 +130,8 @@ def rendering(config: Any) -> Iterator[Finding]:
         times = {each: _render(config.task, size, each) for each in RENDER_QUALITIES}
     except (ImportError, RuntimeError) as error:
         advice = f"{_GL_INSTALL}; or unset MUJOCO_GL, if you set it"
-        yield Finding("fault", "MUJOCO_GL", f"{backend}: {error}", advice)
+        level = _without_gl(config)
+        yield Finding(level, "MUJOCO_GL", f"{backend}: {error}", advice)
         return
     yield Finding("ok", "MUJOCO_GL", backend)
     name, _ = times["paper"]

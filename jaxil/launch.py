@@ -38,6 +38,9 @@ def main(argv: list[str]) -> int:
     native = agents.uses_native_convolutions(config)
     description = provenance.describe(gl_name, native=native)
     with workdir.opened(folder):
+        # Another process may have begun and ended a run there in the meantime.
+        if faults := workdir.problems(folder, config):
+            raise UsageError(faults)
         try:
             workdir.write_config(folder, config, description)
             finished = train.train(config, folder)

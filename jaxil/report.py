@@ -10,6 +10,7 @@ rewrites it until Ctrl-C, and a browser that shows the page reloads it.
 """
 
 import contextlib
+import os
 import pathlib
 import sys
 import time
@@ -42,7 +43,7 @@ def _problems(values: flags.FlagValues) -> list[str]:
     from jaxil.reporting import folder
 
     roots = _roots(values)
-    missing = [root for root in roots if not root.is_dir()]
+    missing = [root for root in roots if not os.path.isdir(root)]
     faults = [f"there is no folder {str(root)!r}" for root in missing]
     if not roots:
         faults.append("name the folders of runs: jaxil report RUNS...")

@@ -8,8 +8,8 @@ r"""Trains many runs: tasks x variants x seeds, on this machine or a Slurm clust
 Each run is an ordinary `python -m jaxil.launch` in DIR/TASK/VARIANT/seedN. Rerun the
 same command to complete missing, interrupted and failed runs; finished ones are not
 repeated. --config.FIELD=VALUE changes a field in all runs that have it. Ctrl-C saves
-and stops the runs on this machine. Exit status 1: a run has failed, is damaged or is
-unfinished.
+and stops the runs on this machine. Exit status 1: a run has failed, is damaged or, if
+this command was to finish it, is unfinished.
 """
 
 import os
@@ -141,7 +141,7 @@ def _checked_runs(
         folder = workdir.from_flag(values.workdir)
     except UsageError as error:
         faults += error.faults
-        folder = pathlib.Path()
+        folder = None
     pairs = [
         word.lstrip("-").removeprefix("config.").partition("=") for word in overrides
     ]

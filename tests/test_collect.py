@@ -1,6 +1,7 @@
 """`collect`: recording, showing and converting, as people type it."""
 
 import itertools
+import os
 import subprocess
 import time
 
@@ -170,6 +171,11 @@ def test_pixels_keep_their_size_unless_another_is_asked_for(tmp_path):
             "--action_repeat is not fo",
         ),
         (["--inspect=setup.cfg", "--fit=pad"], "--fit is not for --inspect"),
+        (["--inspect=walker_walk", "--frame_skip=2"], "--frame_skip is for pixels"),
+        (
+            ["--convert=walker_walk", "--output=x.npz", "--camera=a", "--fit=pad"],
+            "--fit is for pixels",
+        ),
         (["--inspect=a", "--image_size=2"], "image_size"),
         (["--inspect=a", "--render_quality=good"], "render_quality"),
     ],
@@ -188,6 +194,21 @@ def test_wrong_use_ends_with_status_2_and_no_traceback(tmp_path):
     assert finished.returncode == 2
     assert str(damaged) in finished.stderr
     assert "Traceback" not in finished.stderr
+
+
+def test_a_name_that_the_terminal_cannot_show_ends_no_command(few, tmp_path):
+    output = os.fsencode(tmp_path) + b"/\xff.npz"
+    words = arguments("collect", f"--convert={few}", "--image_size=8")
+    done = subprocess.run(
+        [*words, b"--output=" + output],
+        check=False,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONIOENCODING": "utf-8:strict"},
+        capture_output=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    assert b"\\udcff.npz: 2 episodes" in done.stdout
 
 
 def test_killed_while_writing_leaves_the_old_file(few, tmp_path):

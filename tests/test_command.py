@@ -105,6 +105,20 @@ def test_a_file_whose_config_lacks_fields_is_one_sentence(lines, lacking, tmp_pa
     assert f"leaves out {lacking}; start from" in fault
 
 
+@pytest.mark.parametrize("field", ["method", "task", "seed", "encoder.channels"])
+def test_a_file_with_none_in_a_field_is_one_sentence(field, tmp_path):
+    (tmp_path / "own.py").write_text(
+        "from jaxil.config import default_config\n"
+        "def get_config():\n"
+        "    config = default_config('pdac', 'walker_walk')\n"
+        f"    config.{field} = None\n"
+        "    return config\n"
+    )
+    flags = (f"--config={tmp_path}/own.py", "--config.seed=3", "--config.method=psil")
+    (fault,) = _faults(*flags)
+    assert f"{field}=None must be" in fault
+
+
 def test_fields_that_a_file_misspells_are_named(tmp_path):
     (tmp_path / "own.py").write_text(
         "from jaxil.config import default_config\n"

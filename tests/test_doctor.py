@@ -137,6 +137,9 @@ def test_missing_gl_libraries(monkeypatch):
 def test_nothing_renders(monkeypatch, config):
     monkeypatch.setenv("MUJOCO_GL", "disable")
     assert one(doctor.rendering(config), "MUJOCO_GL").level == "fault"
+    config.observation = "state"  # which needs no rendering, as of an expert
+    assert one(doctor.rendering(config), "MUJOCO_GL").level == "warning"
+    config.observation = "pixels"
 
     def fail(*_, **__):
         raise RuntimeError("nothing here can render")

@@ -24,6 +24,7 @@ FLOORS = {
     "command": 9,  # checks a config as training does
     "train": 9,
     "timing": 10,
+    "record": 10,
     "sweeps": 10,
 }
 TOP = 11

@@ -8,6 +8,7 @@ from jaxil.errors import Fault
 from jaxil.sweeps import clusters, plan
 from jaxil.sweeps.clusters import Cluster
 from jaxil.training import workdir
+from tests import commands
 from tests.commands import call
 from tests.sweep_plans import config_of, faults_of, make_runs
 
@@ -147,7 +148,7 @@ def test_every_fault_of_every_run_is_told_once(tmp_path):
     expected = (
         "--methods='gail' is unknown; choose one of: pdac, psil",
         "--ablation='figure1' is unknown",
-        "--seeds=0 must be at least 1",
+        "--seeds=0 must lie in [1, 10000]",
         "not writable",
         "--config.seed='3' is what the sweep itself sets; use --seeds",
         "field='batchsize' is unknown; did you mean: batch_size",
@@ -203,6 +204,28 @@ def test_flags_of_slurm_alone_are_not_ignored(given, flag):
     assert f"{flag} is for --cluster=slurm" in str(fault)
 
 
+@pytest.mark.parametrize("name", ["slurm", "debug"])
+def test_workers_are_of_this_machine_alone(name):
+    (fault,) = clusters.problems(Cluster(name, num_workers=1), starts=False)
+    assert "--workers=1 is for --cluster=local" in str(fault)
+
+
+def test_jobs_that_slurm_refuses_are_one_sentence(tmp_path, monkeypatch):
+    refusal = "echo 'no partition nope' >&2; exit 1"
+    for name, text in (("sbatch", refusal), ("sinfo", "")):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    done = commands.run(
+        "sweep",
+        *("--methods=zero", "--tasks=walker_walk", "--seeds=1", "--preset=tiny"),
+        *("--cluster=slurm", "--partition=nope", f"--workdir={tmp_path}/runs"),
+    )
+    assert done.returncode == 2
+    assert "finds that Slurm refuses jobs" in done.stderr
+    assert "no partition nope" in done.stderr
+
+
 def test_slurm_commands_without_a_cluster_are_no_slurm(tmp_path, monkeypatch):
     for name, text in (("sbatch", ""), ("sinfo", "echo 'no controller' >&2; exit 1")):
         (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
@@ -215,11 +238,12 @@ def test_slurm_commands_without_a_cluster_are_no_slurm(tmp_path, monkeypatch):
 def test_wrong_use_of_the_command_ends_with_status_2(tmp_path):
     done = call(
         "sweep",
-        *("--methods=gail", "--seeds=0", "--cluster=pbs", "--tasks=walker_wlak"),
+        *("--methods=gail", "--seeds=3000000", "--cluster=pbs", "--tasks=walker_wlak"),
         *("--config.bath_size", "8"),
     )
     assert done.returncode == 2
-    for words in ("gail", "--seeds=0", "'pbs'", "walker_walk", "'bath_size'"):
+    for words in ("gail", "--seeds=3000000", "'pbs'", "walker_walk", "'bath_size'"):
         assert words in done.stderr
     assert "--workdir is missing or empty" in done.stderr
+    assert "single run" not in done.stderr
     assert "Traceback" not in done.stderr

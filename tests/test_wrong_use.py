@@ -145,6 +145,54 @@ def test_wrong_command_lines(flags, expected):
     assert expected in finished.stderr
 
 
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["launch", "--config=LONG", "--workdir=x"],
+        ["launch", "--config=zero:walker_walk", "--workdir=LONG"],
+        ["report", "LONG"],
+        ["report", ".", "--output=LONG"],
+        ["collect", "--inspect=LONG"],
+        ["collect", "--inspect=walker_walk", "--output=LONG"],
+        ["collect", "--convert=walker_walk", "--output=LONG"],
+        ["benchmark", "--config=tiny:zero,walker_walk", "--json=LONG"],
+        ["evaluate", "--workdir=LONG"],
+        ["evaluate", "--workdir=x", "--nogif=3"],
+        ["sweep", "--methods=zero", "--workdir=LONG"],
+    ],
+)
+def test_names_that_no_file_can_have(flags):
+    name, *words = flags
+    finished = call(name, *(word.replace("LONG", "a" * 300) for word in words))
+    assert finished.returncode == 2
+    assert "a" * 20 in finished.stderr or "--nogif is wrong" in finished.stderr
+
+
+def test_the_home_of_a_user_who_does_not_exist_is_a_missing_file(tmp_path):
+    source = "--config.demonstrations.source=~nobody_at_all/x.mp4"
+    flags = small_run("pdac", tmp_path)
+    finished = call("launch", *flags, source)
+    assert finished.returncode == 2
+    assert "~nobody_at_all/x.mp4 cannot be read" in finished.stderr
+
+
+def test_a_run_that_came_in_between_keeps_its_settings(tmp_path, monkeypatch):
+    flags = small_run("zero", tmp_path)
+    config = command.read_config(word for word in flags if "--config" in word)
+    config.seed = 1
+    opened = workdir.opened
+
+    def late(folder):
+        workdir.write_config(folder, config, {})
+        return opened(folder)
+
+    monkeypatch.setattr(workdir, "opened", late)
+    finished = call("launch", *flags)
+    assert finished.returncode == 2
+    assert "seed: 1 there, 0 here" in finished.stderr
+    assert workdir.read_config(tmp_path).seed == 1
+
+
 def test_a_missing_folder_and_a_wrong_task_come_in_one_message():
     finished = call("launch", "--config=configs/tiny.py:bco,walker_wlak")
     assert finished.returncode == 2
@@ -206,6 +254,23 @@ def test_a_folder_without_a_run_is_said(name, tmp_path):
     assert finished.returncode == 2
     assert "holds no run" in finished.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_all_folders_without_a_run_are_said(tmp_path):
+    output = f"--output={tmp_path}/out.npz"
+    finished = call("collect", "--workdirs=nope1,nope2", output)
+    assert finished.returncode == 2
+    for name in ("nope1", "nope2"):
+        assert f"workdir='{name}' holds no run" in finished.stderr
+
+
+def test_a_wrong_policy_and_a_wrong_task_come_in_one_message(tmp_path):
+    for task, said in (("walker_wlak", "walker_walk"), ("nope:make", "'nope:make'")):
+        flags = (f"--task={task}", "--policy=nope:x", f"--output={tmp_path}/out.npz")
+        finished = call("collect", *flags)
+        assert finished.returncode == 2
+        for words in ("--policy='nope:x' cannot be loaded", said):
+            assert words in finished.stderr
 
 
 def test_a_video_that_cannot_be_written_costs_no_returns(tmp_path, monkeypatch):

@@ -201,7 +201,7 @@ def _request(wanted: dict[str, Any]) -> Wanted:
 def _path_of(source: str | os.PathLike, task: str) -> pathlib.Path:
     if not str(source):
         return states.shipped_path(task)
-    return pathlib.Path(source).expanduser()
+    return pathlib.Path(os.path.expanduser(source))
 
 
 def _returns(task_rewards: np.ndarray | None) -> list[float]:

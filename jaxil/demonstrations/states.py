@@ -130,7 +130,7 @@ def located(name: str) -> pathlib.Path:
     Raises DemonstrationError if there is neither.
     """
     path = pathlib.Path(name)
-    if path.exists():
+    if os.path.exists(path):
         return path
     if name in shipped_tasks():
         return shipped_path(name)

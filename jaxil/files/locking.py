@@ -94,7 +94,9 @@ def _owned(path: pathlib.Path) -> Iterator[None]:
         yield
     finally:
         ended.set()
-        path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # it may have been taken over
+            if path.read_text() == owner:
+                path.unlink()
 
 
 def _claim(path: pathlib.Path, owner: str) -> None:

@@ -11,6 +11,17 @@ import uuid
 from collections.abc import Iterator
 
 _TEMPORARY = re.compile(r"\.tmp-.*|\.deleting_.*")
+_MAX_NAME_BYTES = 255
+
+
+def wrong_name(path: str | os.PathLike) -> str | None:
+    """Returns why no file can have a path; None if one can."""
+    parts = pathlib.Path(path).absolute().parts
+    longest = max(parts, key=lambda part: len(os.fsencode(part)))
+    if len(os.fsencode(longest)) > _MAX_NAME_BYTES:
+        length = len(os.fsencode(longest))
+        return f"a name of {length} bytes, {longest[:40]!r}...: at most 255 are allowed"
+    return "a zero byte in its name" if any("\0" in part for part in parts) else None
 
 
 def obstacle(folder: str | os.PathLike) -> str | None:
@@ -18,6 +29,8 @@ def obstacle(folder: str | os.PathLike) -> str | None:
 
     Tried with a file without a name: permissions alone do not tell a read-only disk.
     """
+    if why := wrong_name(folder):
+        return why
     path = pathlib.Path(folder).absolute()
     # Not pathlib's `exists`, which raises in folders that it may not search.
     nearest = next(each for each in (path, *path.parents) if os.path.exists(each))

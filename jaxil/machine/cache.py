@@ -11,9 +11,9 @@ def cache_folder() -> pathlib.Path:
     """Returns $JAXIL_CACHE, else `jaxil` in the user's cache folder."""
     own = os.environ.get("JAXIL_CACHE")
     if own:
-        return pathlib.Path(own).expanduser()
+        return pathlib.Path(os.path.expanduser(own))
     shared = os.environ.get("XDG_CACHE_HOME")
-    return pathlib.Path(shared or "~/.cache").expanduser() / "jaxil"
+    return pathlib.Path(os.path.expanduser(shared or "~/.cache"), "jaxil")
 
 
 def compilation_folder() -> pathlib.Path:

@@ -7,7 +7,7 @@ import shutil
 import uuid
 from collections.abc import Iterator
 
-from jaxil.files.writing import obstacle
+from jaxil.files.writing import obstacle, wrong_name
 
 # This line marks index.html as a report, so that only reports are replaced.
 MARK = '<meta name="generator" content="jaxil.report">'
@@ -20,11 +20,11 @@ def problems(output: pathlib.Path) -> list[str]:
     name = f"--output={str(output)!r}"
     real = pathlib.Path(os.path.realpath(output))
     try:
-        if real.exists() and not real.is_dir():
+        if os.path.exists(real) and not os.path.isdir(real):
             return [f"{name} is a file; name a new folder, such as --output=report"]
-        if why := obstacle(real.parent):
+        if why := wrong_name(real) or obstacle(real.parent):
             return [f"{name} cannot be written ({why}); name another folder"]
-        stranger = _stranger(real) if real.is_dir() else None
+        stranger = _stranger(real) if os.path.isdir(real) else None
     except OSError as error:
         return [f"{name} cannot be read ({error.strerror}); name another folder"]
     if stranger is None:

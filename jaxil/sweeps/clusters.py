@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-from jaxil.errors import Fault, unknown_name
+from jaxil.errors import Fault, UsageError, unknown_name
 from jaxil.machine import devices
 from jaxil.sweeps import state
 from jaxil.sweeps.state import Run
@@ -80,7 +80,10 @@ def problems(cluster: Cluster, *, starts: bool) -> Iterator[Fault]:
             way_out = "run this on a login node of your cluster, or use --cluster=local"
             yield Fault("--cluster", f"finds no Slurm here: {fault}", way_out, "slurm")
     most = len(os.sched_getaffinity(0))
-    if cluster.num_workers is not None and not 1 <= cluster.num_workers <= most:
+    if cluster.num_workers is not None and cluster.name in ("slurm", "debug"):
+        rule, way_out = "is for --cluster=local", "leave it out"
+        yield Fault("--workers", rule, way_out, cluster.num_workers)
+    elif cluster.num_workers is not None and not 1 <= cluster.num_workers <= most:
         rule = f"must lie in [1, {most}]: a run needs a core, and there are {most}"
         yield Fault("--workers", rule, value=cluster.num_workers)
     if cluster.name in CLUSTERS and cluster.name != "slurm":
@@ -213,8 +216,12 @@ def submit(cluster: Cluster, runs: Sequence[Run], logs: pathlib.Path) -> None:
       cluster: checked.
       runs: at least one; their commands are run in the current folder.
       logs: folder of what submitit writes; all nodes must see it.
+
+    Raises:
+      UsageError: Slurm refuses them, for its partition, say.
     """
     import submitit
+    from submitit.core.utils import FailedJobError
 
     minutes = max(round(cluster.hours * 60), 1)
     executor = submitit.SlurmExecutor(logs, max_num_timeout=_REQUEUES)
@@ -234,7 +241,12 @@ def submit(cluster: Cluster, runs: Sequence[Run], logs: pathlib.Path) -> None:
     for first in range(0, len(runs), _ARRAY_SIZE):
         some = runs[first : first + _ARRAY_SIZE]
         jobs = [Job([run], Place(), here, _PATIENCE_SECONDS) for run in some]
-        for run, job in zip(some, executor.submit_array(jobs), strict=True):
+        try:
+            submitted = executor.submit_array(jobs)
+        except FailedJobError as error:
+            rule = f"finds that Slurm refuses jobs: {error}"
+            raise UsageError(Fault("--cluster", rule, value="slurm")) from error
+        for run, job in zip(some, submitted, strict=True):
             state.note_slurm_job(run, job.job_id)
 
 
@@ -243,10 +255,10 @@ def queued_jobs(runs: Sequence[Run]) -> frozenset[str]:
     has_jobs = any(os.path.exists(run.folder / "slurm_job") for run in runs)
     if not has_jobs or shutil.which("squeue") is None:
         return frozenset()
-    user = f"--user={getpass.getuser()}"
     try:
+        user = f"--user={getpass.getuser()}"
         listed = _output("squeue", "--noheader", "--array", "--format=%i", user)
-    except (subprocess.SubprocessError, OSError):
+    except (subprocess.SubprocessError, OSError, KeyError):  # of a user without a name
         return frozenset()  # without it a run may be queued twice, but not done twice
     return frozenset(listed.split())
 

@@ -1,6 +1,7 @@
 """What a sweep is made of: each run's folder, settings and command."""
 
 import dataclasses
+import os
 import pathlib
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -19,6 +20,7 @@ PRESETS = ("paper", "tiny")
 # What the sweep itself sets in each run.
 _OWN_FLAGS = {"seed": "--seeds", "task": "--tasks", "method": "--methods"}
 _SHOWN = 3  # runs that a fault lists
+_MAX_SEEDS = 10_000
 
 
 class Request(NamedTuple):
@@ -29,7 +31,7 @@ class Request(NamedTuple):
     tasks: Sequence[str]
     num_seeds: int
     preset: str
-    folder: pathlib.Path  # of the sweep
+    folder: pathlib.Path | None  # of the sweep; None if the user named none
     overrides: Mapping[str, str]  # of config fields, in all runs that have the field
 
 
@@ -63,7 +65,7 @@ def make_runs(
         else:
             found += [(fault, where) for fault in config_problems(config)]
             planned.append((config, list(_seeds(request, config, words))))
-    if not found:
+    if not found and request.folder is not None:
         found = [
             (fault, run.name)
             for config, runs in planned
@@ -92,17 +94,11 @@ def _request_problems(
             yield unknown_name("--ablation", ablation, tuple(studies))
     if not request.tasks:
         yield Fault("--tasks", "is empty", "leave it out for the paper's eight")
-    if request.num_seeds < 1:
-        yield Fault("--seeds", "must be at least 1", value=request.num_seeds)
-    if (request.folder / "config.json").exists():
-        yield Fault(
-            "--workdir",
-            "is the folder of a single run",
-            "name another for the sweep",
-            str(request.folder),
-        )
-    else:
-        yield from workdir.problems(request.folder, jaxil_config.default_config())
+    if not 1 <= request.num_seeds <= _MAX_SEEDS:
+        rule = f"must lie in [1, {_MAX_SEEDS}]"
+        yield Fault("--seeds", rule, value=request.num_seeds)
+    if request.folder is not None:
+        yield from _place_problems(request.folder)
     known = {
         field: None
         for choice in choices
@@ -118,6 +114,13 @@ def _request_problems(
             yield Fault(f"--config.{field}", rule, way_out, value)
         elif field not in known and not any(":" in name for name in faulty):
             yield unknown_name("field", field, tuple(known))
+
+
+def _place_problems(folder: pathlib.Path) -> Iterable[Fault]:
+    if os.path.exists(folder / "config.json"):
+        rule, way_out = "is the folder of a single run", "name another for the sweep"
+        return [Fault("--workdir", rule, way_out, str(folder))]
+    return workdir.problems(folder, jaxil_config.default_config())
 
 
 def _method_problems(method: str) -> tuple[Fault, ...]:
@@ -185,8 +188,9 @@ def _preset(preset: str, method: str, task: str) -> list[str]:
 def _seeds(request: Request, config: Config, words: list[str]) -> Iterator[Run]:
     # The settings name the variant: --config.shift_padding=0 makes another one.
     slug = figures.variant_of(config.to_dict()).slug
-    for seed in range(request.num_seeds):
-        folder = request.folder / config.task / slug / f"seed{seed}"
+    sweep = request.folder or pathlib.Path()
+    for seed in range(min(request.num_seeds, _MAX_SEEDS)):
+        folder = sweep / config.task / slug / f"seed{seed}"
         own = (f"--config.seed={seed}", f"--workdir={folder}")
         yield Run(
             task=config.task,

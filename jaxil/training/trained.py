@@ -110,7 +110,7 @@ def load_policy(folder: str | os.PathLike) -> Policy:
     Raises:
       UsageError: there is no run, no checkpoint, or none can be read.
     """
-    folder = pathlib.Path(folder).expanduser()
+    folder = pathlib.Path(os.path.expanduser(folder))
     return _policy(folder, workdir.read_config(folder, imports_task=False))
 
 

@@ -50,19 +50,15 @@ def from_flag(value: str | None) -> pathlib.Path:
         raise UsageError(
             "--workdir is missing or empty: name a folder, such as --workdir=runs/1"
         )
-    path = pathlib.Path(value)
     try:
-        longest = max(len(part.encode()) for part in path.absolute().parts)
+        value.encode()
     except UnicodeEncodeError as error:
         raise UsageError(
             f"--workdir={value!r} is not UTF-8; choose a name that is"
         ) from error
-    if longest > 255 or "\0" in value:
-        raise UsageError(
-            f"--workdir={value[:40]!r}... has a name of {longest} bytes: expected at "
-            "most 255, none of them zero; choose another"
-        )
-    return path
+    if why := writing.wrong_name(value):
+        raise UsageError(f"--workdir has {why}; choose another")
+    return pathlib.Path(value)
 
 
 def output_problems(values: Any) -> Sequence[Fault | str]:
@@ -243,8 +239,9 @@ def demonstrations_digest(config: Config) -> str | None:
     """Returns a digest of what the demonstrations' file holds; None if unreadable."""
     try:
         source = config.demonstrations.source
-        path = pathlib.Path(source) if source else states.shipped_path(config.task)
-        return states.digest(path.expanduser())
+        if source:
+            return states.digest(pathlib.Path(os.path.expanduser(source)))
+        return states.digest(states.shipped_path(config.task))
     except DemonstrationError:
         return None
 

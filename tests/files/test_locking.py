@@ -141,6 +141,14 @@ def test_an_owner_elsewhere_lives_as_long_as_it_touches_its_file(left, place):
         assert is_locked(left)
 
 
+def test_an_owner_s_file_that_was_taken_over_is_left(tmp_path, monkeypatch):
+    _refuse_locks(monkeypatch)
+    owner = tmp_path / "lock.owner"
+    with locked(tmp_path / "lock"):
+        owner.write_text("another")
+    assert owner.read_text() == "another"
+
+
 def test_an_owner_touches_its_file(tmp_path, monkeypatch):
     _refuse_locks(monkeypatch)
     monkeypatch.setattr(locking, "_HEARTBEAT_SECONDS", 0.01)
