@@ -133,10 +133,10 @@ FIELDS: dict[str, Field] = {
         False, "keeps a copy of the replay's frames on the device; only speed changes"
     ),
     "updates_per_dispatch": Field(
-        1, "updates per device call; the policy lags by up to N - 1", 1, 1_000
+        1, "updates per device call; the policy lags by up to N - 1 of them", 1, 1_000
     ),
     "num_environments": Field(
-        1, "in parallel processes; the policy lags by up to N - 1", 1, 64
+        1, "in parallel processes; the policy lags by up to N - 1 steps", 1, 64
     ),
     "compute_dtype": Field(
         "float32", "of convolutions and trunks", choices=("float32", "bfloat16")
@@ -211,8 +211,9 @@ def defaults(method: str, task: str) -> Config:
 
 def frames_of_updates(config: Config) -> int:
     """Returns the length of a run of a method that does not play."""
-    per_update = config.update_every_steps * config.action_repeat
-    return methods.get(config.method).total_updates * per_update
+    total_updates = methods.get(config.method).total_updates
+    times = -(-total_updates // config.updates_per_step)
+    return times * config.update_every_steps * config.action_repeat
 
 
 def fields(method: str) -> dict[str, Field]:
@@ -327,8 +328,8 @@ def _encoder_problems(config: Config) -> Iterator[Fault]:
         )
         return
     for name, values in layers.items():
-        if any(not isinstance(v, int) or v < 1 for v in values):
-            rule = "must hold whole numbers of at least 1"
+        if not values or any(not isinstance(v, int) or v < 1 for v in values):
+            rule = "must hold whole numbers of at least 1, one per layer"
             yield Fault(f"encoder.{name}", rule, value=values)
             return
     if config.observation != "pixels":

@@ -93,7 +93,7 @@ SINKHORN = {
         choices=("transport", "time"),
     ),
     "epsilon": Field(
-        0.01, "weight of the entropy, in units of cost; 0.01 in ROT", 1e-6, 1e3
+        0.01, "weight of the entropy, in units of cost; 0.01 in ROT", 1e-4, 1e3
     ),
     "num_iterations": Field(100, "Sinkhorn iterations; 100 in ROT", 1, 10**6),
     "return_scale": Field(

@@ -80,8 +80,8 @@ class Run(Parts):
                 # The learner computes while the simulators step and render.
                 learn(len(actions))
                 episodes = player.observe()
-            for index, episode in enumerate(episodes):
-                self.store(episode, later=episodes[index + 1 :])
+            for episode in episodes:
+                self.store(episode)
             if episodes or player is None:
                 if self.is_due(counters.last_eval_step, config.eval_every_frames):
                     self.evaluate()
@@ -148,14 +148,8 @@ class Run(Parts):
         if metrics is not None:
             self.counters.metrics = metrics
 
-    def store(self, episode: Episode, *, later: list[Episode]) -> None:
-        """Rewards a finished episode and stores it; refreshes rewards where due.
-
-        Args:
-          episode: with the task's rewards.
-          later: those that ended in the same round and are stored after it. In the
-            table they stand as if played one after the other, in equal times.
-        """
+    def store(self, episode: Episode) -> None:
+        """Rewards a finished episode and stores it; refreshes rewards where due."""
         # Updates may not see an episode that is stored after they were due, and rewards
         # come from all that was learned. Their own clock starts once that is done.
         self.stopwatch.timed("update", self.flush)()
@@ -165,9 +159,7 @@ class Run(Parts):
         with told_as("the task", "an episode"):  # the state's numbers are not finite
             self.replay.add_episode(**episode._replace(rewards=rewards)._asdict())
         self.updates.episode_added()
-        if self.refresh_is_due():
-            self.updates.refresh_rewards(self.state, self.require_finite)
-            self.counters.last_refresh_step = self.counters.num_steps
+        self.refresh_if_due()
         seconds = time.perf_counter() - start
         self.stopwatch.reward_seconds += seconds
         self.stopwatch.seconds["update"] += seconds
@@ -176,11 +168,10 @@ class Run(Parts):
         metrics = as_floats(self.counters.metrics | summary)
         metrics["replay/reward"] = self.replay.mean_reward()
         self.require_finite(metrics)
-        since_last_row = time.monotonic() - self.started - self.counters.seconds
-        self.counters.seconds += since_last_row / (1 + len(later))
+        counters = self.counters
+        counters.seconds = time.monotonic() - self.started
         rewards_by_kind = {"task": episode.rewards, "imitation": rewards}
         self.returns = as_floats({n: np.sum(r) for n, r in rewards_by_kind.items()})
-        later_steps = sum(len(each.actions) for each in later)
         row = {
             "task_return": self.returns["task"],
             "imitation_return": self.returns["imitation"],
@@ -188,10 +179,8 @@ class Run(Parts):
             "reward_seconds": round(self.stopwatch.reward_seconds, 3),
             **metrics,
         }
-        frame = self.frame - later_steps * self.config.action_repeat
-        counters = self.counters
-        self.log.episode(frame, counters.seconds, counters.num_episodes, row)
-        self.counters.num_episodes += 1
+        self.log.episode(self.frame, counters.seconds, counters.num_episodes, row)
+        counters.num_episodes += 1
 
     def reward(self, episode: Episode) -> np.ndarray:
         """Returns the method's rewards [T] of a finished episode, which it observes."""
@@ -204,14 +193,18 @@ class Run(Parts):
         self.require_finite({name: float(np.sum(rewards))})
         return rewards
 
-    def refresh_is_due(self) -> bool:
-        """Returns whether all stored rewards are to be recomputed now."""
-        every = self.config.reward_refresh_steps
+    def refresh_if_due(self) -> None:
+        """Recomputes all stored rewards if they are stale and it is time to."""
+        every, counters = self.config.reward_refresh_steps, self.counters
         changed = self.agent.rewarder.rewards_changed
-        passed = self.counters.num_steps - self.counters.last_refresh_step
-        if not every or passed < every or changed is None:
-            return False
-        return bool(changed(self.state.rewarder))
+        if not every or changed is None:
+            return
+        counters.rewards_are_stale |= bool(changed(self.state.rewarder))
+        passed = counters.num_steps - counters.last_refresh_step
+        if passed >= every and counters.rewards_are_stale:
+            self.updates.refresh_rewards(self.state, self.require_finite)
+            counters.last_refresh_step = counters.num_steps
+            counters.rewards_are_stale = False
 
     def require_finite(self, values: dict[str, float]) -> None:
         """Raises TrainingDiverged where a number is not finite."""
@@ -282,6 +275,12 @@ class Run(Parts):
             mean_image=self.agent.mean_image,
         )
 
+    @property
+    def is_finished(self) -> bool:
+        """Whether the budget is used up and evaluated."""
+        is_spent = self.frame >= self.config.total_frames and not self.is_playing
+        return is_spent and not self.counters.owes_evaluation
+
     def finish(self) -> None:
         """Saves what is not saved yet."""
         if self.counters.last_checkpoint_step != self.counters.num_steps:
@@ -341,10 +340,10 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
             way_out = f"Rerun the same command to {does}"
             raise EnvironmentsFailed(f"{error}\n{newest}. {way_out}") from error
         run.finish()
-    if not (run.stop_asked or run.state.num_updates):
+    if run.is_finished and not run.state.num_updates:
         screen.say("nothing was learned: lower seed_frames or num_steps")
     ended, way_on = "finished", "raise --config.total_frames to train further"
-    if run.stop_asked:
+    if not run.is_finished:
         ended, way_on = "stopped", "rerun the same command to resume"
     screen.say(f"{ended} at frame {run.frame}, saved; {way_on}")
-    return not run.stop_asked
+    return run.is_finished

@@ -70,9 +70,11 @@ def test_several_environments_take_turns_with_the_learner():
         *("store [20, 21, 22, 23]", "store [30, 31, 32, 33]"),
         *("last evaluation", "save"),
     ]
-    # In the table they stand as if played one after the other.
-    assert [row["frame"] for row in dummies.rows] == [6, 12, 18, 24]
-    assert np.all(np.diff([row["seconds"] for row in dummies.rows]) > 0)
+    # Rows are of the frame at which they are written, as checkpoints are: a resumed
+    # run then drops exactly those that it will write again.
+    assert [row["frame"] for row in dummies.rows] == [12, 12, 24, 24]
+    assert [row["episode"] for row in dummies.rows] == [0, 1, 2, 3]
+    assert np.all(np.diff([row["seconds"] for row in dummies.rows]) >= 0)
 
 
 def test_several_updates_may_follow_a_step():
@@ -171,6 +173,17 @@ def test_rewards_are_refreshed_at_ends_of_episodes(every, changes_at, expected):
     assert refreshed == expected
     if expected:  # after the episode has entered the replay
         assert dummies.tape[dummies.tape.index("refresh") - 1].startswith("store")
+
+
+def test_rewards_that_change_before_a_refresh_is_due_are_refreshed_then():
+    dummies = Dummies(reward_refresh_steps=4, total_frames=24)
+    counters = dummies.run.counters
+    dummies.rewarder.rewards_changed = lambda _: np.bool_(counters.num_steps in (3, 9))
+    dummies.loop()
+    ends = [word for word in dummies.tape if word.startswith(("store", "refresh"))]
+    # At step 6 those of step 3, at step 12 those of step 9.
+    assert [k for k, word in enumerate(ends) if word == "refresh"] == [2, 5]
+    assert not counters.rewards_are_stale
 
 
 def test_rewards_that_never_change_are_not_refreshed():

@@ -109,6 +109,21 @@ def test_a_stopped_evaluation_is_made_up_for_at_once_and_saved():
     assert not dummies.run.counters.owes_evaluation
 
 
+def test_a_stop_in_the_last_round_is_a_finished_run():
+    dummies = Dummies()
+    evaluate = dummies.run.evaluator.evaluate
+
+    def then_stop(*args, **kwargs):
+        result = evaluate(*args, **kwargs)
+        dummies.run.stop_asked = kwargs["is_last"]
+        return result
+
+    dummies.run.evaluator.evaluate = then_stop
+    dummies.loop()
+    assert dummies.run.stop_asked
+    assert dummies.run.is_finished
+
+
 def test_a_method_that_does_not_play_writes_the_row_of_a_stopped_evaluation_once():
     dummies = Dummies(eval_every_frames=8, total_frames=16)
     run, updates = dummies.run, []

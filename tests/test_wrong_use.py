@@ -34,6 +34,7 @@ _BAD_VALUES = (
     ("image_size", 10, ("too small for the encoder", "at least 15")),
     ("encoder.strides", (2, 1), ("lengths differ",)),
     ("encoder.channels", (32, 0, 32, 32), ("encoder.channels",)),
+    ("sinkhorn.epsilon", 1e-5, ("sinkhorn.epsilon=1e-05", "[0.0001, 1000.0]")),
     ("exploration_std_end", 2.0, ("must not grow",)),
     ("learning_rate_end", 2e-4, ("is above learning_rate=0.0001", "must not grow")),
     ("discriminator.batch_size", 512, ("at most 256",)),
@@ -66,6 +67,14 @@ def test_a_bad_value_is_named_with_rule_and_way_out(field, value, expected):
     assert len(faults) == 1
     for word in expected:
         assert word in str(faults[0])
+
+
+def test_an_encoder_has_a_layer():
+    config = jaxil_config.default_config("pdac", "walker_walk")
+    for name in ("channels", "kernel_sizes", "strides"):
+        config.encoder[name] = ()
+    (fault,) = jaxil_config.problems(config, _TASKS)
+    assert "encoder.channels=() must hold whole numbers of at least 1" in str(fault)
 
 
 def test_smallest_image_is_the_one_that_leaves_one_pixel():

@@ -4,7 +4,8 @@ import chex
 import jax.numpy as jnp
 from jax import Array, lax
 
-_TINY = 1e-12  # keeps directions without variance at zero instead of NaN
+# Shorter directions, relative to the longest, are float32's rounding.
+_NEGLIGIBLE = 1e-5
 
 
 def merge(sketch: Array, rows: Array) -> Array:
@@ -37,8 +38,13 @@ def merge(sketch: Array, rows: Array) -> Array:
 
 
 def project(rows: Array, sketch: Array) -> Array:
-    """Returns coordinates along the sketch's directions: [M, P], [J, P] to [M, J]."""
+    """Returns coordinates along the sketch's directions: [M, P], [J, P] to [M, J].
+
+    Zero along directions that the rows so far do not have.
+    """
     chex.assert_rank([rows, sketch], 2)
     chex.assert_equal_shape_suffix([rows, sketch], 1)
     lengths = jnp.linalg.norm(sketch, axis=1, keepdims=True)
-    return rows @ (sketch / jnp.maximum(lengths, _TINY)).T
+    is_one = lengths > _NEGLIGIBLE * jnp.max(lengths)
+    directions = jnp.where(is_one, sketch / jnp.where(is_one, lengths, 1.0), 0.0)
+    return rows @ directions.T

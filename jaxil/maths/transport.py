@@ -74,7 +74,7 @@ def sinkhorn_plan(
 
     Computed in the log domain, since exp(-C / epsilon) underflows in float32 at the
     epsilon that imitation needs. The last iteration normalises the rows, so each step
-    of the agent has exactly its mass and rewards are not distorted. A fixed number of
+    of the agent has its mass and rewards are not distorted. A fixed number of
     iterations keeps a vmap over demonstrations parallel.
 
     Args:
@@ -85,8 +85,9 @@ def sinkhorn_plan(
       num_iterations: Sinkhorn iterations; static under jit.
 
     Returns:
-      Non-negative plan that sums to one. Rows are exact, columns are as accurate as
-      the iterations have converged. Shape [T, N].
+      Non-negative plan that sums to one. Rows are exact up to the rounding of
+      C / epsilon, whose errors grow with it; columns are as accurate as the iterations
+      have converged. Shape [T, N].
 
     Source: Peyre and Cuturi 2019, Computational Optimal Transport, sec. 4.4.
     """

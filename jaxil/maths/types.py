@@ -34,7 +34,7 @@ class Batch(NamedTuple):
     """Sampled transitions of n agent steps.
 
     Where frames are kept on the device, observations are indices of their F frames
-    instead: int32 [B, F], the oldest first.
+    instead: int32 [B, F], those of a window [B, n, F], the oldest first.
 
     Attributes:
       observation: o_t, uint8 [B, H, W, C], or float32 [B, S] for state vectors.

@@ -62,10 +62,12 @@ class EpisodeRing:
     def clear(self, first_episode: int = 0) -> None:
         """Removes all episodes; the next one gets the number `first_episode`."""
         self._stored: dict[int, _Stored] = {}  # by number, the oldest first
+        self._sums: dict[int, float] = {}  # of rewards, likewise
         self._num_episodes_added = first_episode
         self._num_steps_stored = 0
         self._next_slot = 0
-        self._index_episodes()
+        # First slots and lengths, for sampling.
+        self._starts = self._lengths = np.zeros(0, np.int64)
 
     @property
     def frames(self) -> np.ndarray:
@@ -113,12 +115,16 @@ class EpisodeRing:
         rule = f"at most {self._capacity_steps} steps"
         require(num_steps <= self._capacity_steps, "episode length", num_steps, rule)
 
+        num_removed = 0
         while (
             self._num_steps_stored + num_steps > self._capacity_steps
             # Each episode has one frame more than it has steps.
             or self._num_steps_stored + len(self._stored) + num_steps + 1 > length
         ):
-            self._num_steps_stored -= self._stored.pop(self.oldest_episode).num_steps
+            oldest = self.oldest_episode
+            self._num_steps_stored -= self._stored.pop(oldest).num_steps
+            del self._sums[oldest]
+            num_removed += 1
         start = self._next_slot
         # In two pieces if it wraps around: slices copy faster than index lists.
         head = min(num_steps + 1, length - start)
@@ -129,10 +135,12 @@ class EpisodeRing:
         self._rewards[slots] = rewards
         self._discounts[slots] = discounts
         self._stored[self._num_episodes_added] = _Stored(start, num_steps)
+        self._sums[self._num_episodes_added] = rewards.sum(dtype=np.float64)
+        self._starts = np.append(self._starts[num_removed:], start)
+        self._lengths = np.append(self._lengths[num_removed:], num_steps)
         self._next_slot = (start + num_steps + 1) % length
         self._num_steps_stored += num_steps
         self._num_episodes_added += 1
-        self._index_episodes()
 
     def replace_rewards(self, index: int, rewards) -> None:
         """Replaces the rewards [T] of a stored episode.
@@ -142,7 +150,9 @@ class EpisodeRing:
           ValueError: for a wrong shape or dtype, or a number that is not finite.
         """
         slots = self.slots(index)[:-1]
-        self._rewards[slots] = checked_values("rewards", rewards, self._rewards[slots])
+        rewards = checked_values("rewards", rewards, self._rewards[slots])
+        self._rewards[slots] = rewards
+        self._sums[index] = rewards.sum(dtype=np.float64)
 
     def rewards(self, index: int) -> np.ndarray:
         """Returns a copy of the rewards of a stored episode, [T]."""
@@ -154,8 +164,9 @@ class EpisodeRing:
 
     def mean_reward(self) -> float:
         """Returns the mean of all stored rewards; NaN if there are none."""
-        total = sum(self.rewards(i).sum(dtype=np.float64) for i in self._stored)
-        return float(total / self._num_steps_stored) if self._stored else math.nan
+        if not self._stored:
+            return math.nan
+        return float(sum(self._sums.values()) / self._num_steps_stored)
 
     def episode(self, index: int) -> Episode:
         """Returns a copy of a stored episode; IndexError if it is not stored."""
@@ -177,11 +188,6 @@ class EpisodeRing:
             )
         start, num_steps = self._stored[index]
         return (start + np.arange(num_steps + 1)) % len(self._frames)
-
-    def _index_episodes(self) -> None:
-        """Updates the arrays of first slots and lengths, for sampling."""
-        table = np.array(list(self._stored.values()), np.int64).reshape(-1, 2)
-        self._starts, self._lengths = table.T
 
 
 def ring_slots(capacity_steps: int, episode_steps: int) -> int:

@@ -19,7 +19,7 @@ class Matching(NamedTuple):
       cost: features [T, D] and [N, D] and how many of T and of N are not padding, to
         costs [T, N].
       plan: costs [T, N] and masses of the agent's moments [T] and the expert's [N] to a
-        plan [T, N], whose rows have exactly the agent's masses.
+        plan [T, N], whose rows have the agent's masses.
     """
 
     cost: Callable[[Array, Array, Array, Array], Array]

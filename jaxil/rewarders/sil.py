@@ -79,7 +79,8 @@ def make_rewarder(
 
     Args:
       agent: the embedding's encoder has the architecture of its encoder.
-      cost, alignment, epsilon, num_iterations: see `make_matching`.
+      cost, alignment, epsilon, num_iterations: see `make_matching`. The alignment is
+        that of the rewards; f always learns from transport.
       return_scale: the first episode returns minus this.
       learning_rate: of the embedding's Adam.
       batch_size: expert samples, and agent samples, in an update.
@@ -91,6 +92,13 @@ def make_rewarder(
     """
     matching = make_matching(
         cost=cost, alignment=alignment, epsilon=epsilon, num_iterations=num_iterations
+    )
+    # A batch has no order in time.
+    unordered = make_matching(
+        cost=cost,
+        alignment="transport",
+        epsilon=epsilon,
+        num_iterations=num_iterations,
     )
     embedding = Embedding(agent.networks.encoder, agent.feature_dim)
     optimiser = optax.adam(learning_rate)
@@ -124,7 +132,7 @@ def make_rewarder(
 
         def loss(params: Params) -> Array:
             mine, experts = jnp.split(apply(embedding, params, both), 2)
-            return -batch_distance(matching, mine, experts)
+            return -batch_distance(unordered, mine, experts)
 
         value, gradients = jax.value_and_grad(loss)(state.embedding.params)
         state = state.replace(

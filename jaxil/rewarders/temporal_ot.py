@@ -30,9 +30,10 @@ METHOD = methods.Method(
                 0,
                 10**6,
             ),
-            # A blocked pair costs 1000; with a larger epsilon that would not block it.
+            # A blocked pair costs 1000: with a larger epsilon that would not block it,
+            # with a smaller one float32 could not resolve costs beside it.
             "epsilon": methods.Field(
-                0.01, "weight of the entropy, in units of cost; 0.01", 1e-6, 1.0
+                0.01, "weight of the entropy, in units of cost; 0.01", 1e-3, 1.0
             ),
             "num_iterations": methods.SINKHORN["num_iterations"],
             "return_scale": methods.SINKHORN["return_scale"],

@@ -35,6 +35,8 @@ from jaxil.native import build, encoding
 from jaxil.networks.agent import AgentNetworks, make_agent_networks
 from jaxil.training import lengths
 
+_MAX_UPDATES = 2**31 - 1  # an int32 counts them
+
 
 class Agent(NamedTuple):
     """The compiled functions of a run, and its first state.
@@ -100,9 +102,9 @@ def learning_rate(config: Config) -> optax.ScalarOrSchedule:
     if not config.learning_rate_steps:
         return config.learning_rate
     share = config.updates_per_step / config.update_every_steps
-    num_updates = config.learning_rate_steps * share
+    num_updates = min(math.ceil(config.learning_rate_steps * share), _MAX_UPDATES)
     return optax.linear_schedule(
-        config.learning_rate, config.learning_rate_end, math.ceil(num_updates)
+        config.learning_rate, config.learning_rate_end, num_updates
     )
 
 

@@ -93,7 +93,9 @@ class Evaluator:
             )
             distance, sides, filmed = None, [], {}
             if self._distance is not None:
-                distance = self._distance.relative_distance(evaluation.episodes)
+                distance = self._distance.relative_distance(
+                    evaluation.episodes, stop_asked=stop_asked
+                )
             if films:
                 filmed = self.explain(state, evaluation.episodes[0])
                 # Rendering this large takes as long as playing one or two episodes.

@@ -4,6 +4,7 @@ import json
 import math
 import pathlib
 import zlib
+from collections.abc import Callable
 from typing import Any
 
 import flax.linen as nn
@@ -75,13 +76,23 @@ class ExpertDistance:
             [whole[:n] for whole, n in zip(frames, demonstrations.num_frames)]
         )
 
-    def relative_distance(self, episodes: list[Episode]) -> float:
+    def relative_distance(
+        self,
+        episodes: list[Episode],
+        *,
+        stop_asked: Callable[[], bool] = lambda: False,
+    ) -> float:
         """Returns the distance of an evaluation's episodes; a random policy has 1.
 
+        Args:
+          episodes: at most MAX_EPISODES are used.
+          stop_asked: asked before each step of the random policy.
+
         Raises:
+          Stopped: `stop_asked` said so.
           RunFolderError: the random policy's distance cannot be stored.
         """
-        return self._distance(episodes) / self._of_random_policy()
+        return self._distance(episodes) / self._of_random_policy(stop_asked)
 
     def _distance(self, episodes: list[Episode]) -> float:
         agent = self._embed_all([episode.frames for episode in episodes])
@@ -90,21 +101,21 @@ class ExpertDistance:
     def _embed_all(self, episodes: list[np.ndarray]) -> Array:
         return jnp.concatenate([self._embed(each) for each in episodes[:MAX_EPISODES]])
 
-    def _of_random_policy(self) -> float:
+    def _of_random_policy(self, stop_asked: Callable[[], bool]) -> float:
         stored = _read(self._path)
         if stored is not None:
             return stored
-        environment = assembly.environment_with_seed(self._config, _RANDOM_POLICY_SEED)
-        rng = np.random.default_rng(_RANDOM_POLICY_SEED)
-        shape = environment.action_spec().shape
-        played = evaluate(
-            environment,
-            lambda _: rng.uniform(-1.0, 1.0, shape),
-            num_episodes=_RANDOM_EPISODES,
-            first_episode=0,
-            num_kept=_RANDOM_EPISODES,
-        )
-        environment.close()
+        rng, seed = np.random.default_rng(_RANDOM_POLICY_SEED), _RANDOM_POLICY_SEED
+        with assembly.environment_with_seed(self._config, seed) as environment:
+            shape = environment.action_spec().shape
+            played = evaluate(
+                environment,
+                lambda _: rng.uniform(-1.0, 1.0, shape),
+                num_episodes=_RANDOM_EPISODES,
+                first_episode=0,
+                num_kept=_RANDOM_EPISODES,
+                stop_asked=stop_asked,
+            )
         # It may be zero where the expert acts at random too.
         distance = max(self._distance(played.episodes), 1e-12)
         content = {

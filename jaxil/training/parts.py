@@ -1,5 +1,6 @@
 """What a training run is made of, new or from its newest checkpoint."""
 
+import contextlib
 import dataclasses
 import functools
 import pathlib
@@ -38,6 +39,7 @@ class Counters:
       last_eval_step: agent step of the last evaluation.
       last_checkpoint_step: agent step of the last checkpoint.
       last_refresh_step: agent step of the last recomputation of stored rewards.
+      rewards_are_stale: whether stored rewards have changed since.
       owes_evaluation: whether an evaluation was due when the run was stopped.
       metrics: of the last update; for the next row of train.csv.
       seconds: wall-clock of the run, earlier processes included.
@@ -49,6 +51,7 @@ class Counters:
     last_eval_step: int = 0
     last_checkpoint_step: int = 0
     last_refresh_step: int = 0
+    rewards_are_stale: bool = False
     owes_evaluation: bool = False
     metrics: dict[str, Any] = dataclasses.field(default_factory=dict)
     seconds: float = 0.0
@@ -106,7 +109,23 @@ class Parts:
           demonstrations: what the method imitates, or None.
           say: prints a line.
         """
+        with contextlib.ExitStack() as opened:
+            made = cls._make(config, workdir, demonstrations, say, opened)
+            opened.pop_all()
+        return made
+
+    @classmethod
+    def _make(
+        cls,
+        config: Config,
+        workdir: pathlib.Path,
+        demonstrations: Demonstrations | None,
+        say: Callable[[str], None],
+        opened: contextlib.ExitStack,
+    ) -> Self:
+        """Does what `make` does; `opened` closes the environments if that fails."""
         environment = assembly.training_environment(config)
+        opened.callback(environment.close)
         agent = agents.make_agent(config, environment, demonstrations)
         replay = assembly.make_replay(config, environment)
         checkpoints = Checkpoints(workdir, say=say)
@@ -122,6 +141,8 @@ class Parts:
             counters = Counters(**saved)
         else:
             state = agent.init_state()
+        evaluated = assembly.evaluation_environment(config)
+        opened.callback(evaluated.close)
         frame = counters.num_steps * config.action_repeat
         if resumed:
             say(f"resuming from the checkpoint of frame {frame}")
@@ -130,30 +151,27 @@ class Parts:
         distance = None
         if demonstrations is not None:
             distance = ExpertDistance(config, workdir, demonstrations)
+        player = assembly.make_player(
+            config,
+            environment,
+            first_episode=counters.num_episodes + len(open_episodes),
+            open_episodes=open_episodes,
+            timed=functools.partial(TimedEnvironments, stopwatch=stopwatch),
+            say=say,
+        )
+        if player is not None:
+            opened.callback(player.close)
         return cls(
             config=config,
             agent=agent,
             state=state,
             counters=counters,
             episode_steps=environment.episode_steps,
-            player=assembly.make_player(
-                config,
-                environment,
-                first_episode=counters.num_episodes + len(open_episodes),
-                open_episodes=open_episodes,
-                timed=functools.partial(TimedEnvironments, stopwatch=stopwatch),
-                say=say,
-            ),
+            player=player,
             replay=replay,
             updates=Updates(config, agent, replay, demonstrations, experts),
             experts=experts,
-            evaluator=Evaluator(
-                config,
-                agent,
-                assembly.evaluation_environment(config),
-                experts,
-                distance,
-            ),
+            evaluator=Evaluator(config, agent, evaluated, experts, distance),
             checkpoints=checkpoints,
             log=RunLog(
                 workdir,

@@ -27,7 +27,7 @@ TRAIN_COLUMNS = (
     "task_return",  # undiscounted sum of task rewards, which the agent never sees
     "imitation_return",  # the same of the rewards that it learns from
     "length",  # agent steps
-    "frames_per_second",  # since the row before; in a process's first, since frame 0
+    "frames_per_second",  # since a row of an earlier frame; in the first, since frame 0
     "reward_seconds",  # spent on rewards so far, by this process
     # Diagnostics of the learner; those of the method follow.
     "critic/loss",
@@ -106,15 +106,17 @@ class RunLog:
         if demonstrations is not None:
             self._expert_return = demonstrations.mean_return()
         self._last = (0, 0.0)  # frame and seconds of the last row
+        self._speed = 0.0
 
     def episode(
         self, frame: int, seconds: float, episode: int, values: Mapping[str, Any]
     ) -> None:
         """Logs a training episode; `values` are the columns from `task_return` on."""
         last_frame, last_seconds = self._last
-        speed = (frame - last_frame) / max(seconds - last_seconds, 1e-9)
-        self._last = (frame, seconds)
-        row = {"frames_per_second": round(speed, 2), **values}
+        if frame > last_frame:  # else it ended in the same round as the one before
+            self._speed = (frame - last_frame) / max(seconds - last_seconds, 1e-9)
+            self._last = (frame, seconds)
+        row = {"frames_per_second": round(self._speed, 2), **values}
         self._write_training(frame, seconds, episode, row)
 
     def updates(self, *, frame: int, seconds: float, metrics: dict[str, float]) -> None:

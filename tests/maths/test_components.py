@@ -56,6 +56,20 @@ def test_coordinates_are_along_directions_of_length_one():
     np.testing.assert_allclose(components.project(rows, sketch), [[2.0, 7.0, 0.0]])
 
 
+@pytest.mark.parametrize("rank", [1, 2, 5])
+def test_there_are_no_coordinates_beyond_the_rank_of_the_rows(rank):
+    rows = 10.0 * random_rows(rank, 60, rank, 400)
+    sketch = jnp.zeros((8, 400))
+    for part in np.split(rows, 3):
+        sketch = merge(sketch, part)
+    coordinates = components.project(rows, sketch)
+    # A rotation of the rows: nothing is lost, and what is left is zero.
+    np.testing.assert_allclose(
+        np.linalg.norm(coordinates, axis=1), np.linalg.norm(rows, axis=1), rtol=1e-3
+    )
+    np.testing.assert_array_equal(coordinates[:, rank:], 0.0)
+
+
 @pytest.mark.parametrize("rows", [(4,), (4, 5)])
 def test_rejects_rows_of_another_shape(rows):
     with pytest.raises(AssertionError):

@@ -26,11 +26,11 @@ EXPERTS = make_experts(random_frames(50, 2, STEPS + 1))
 
 
 @functools.cache
-def make_rewarder():
+def make_rewarder(alignment="transport"):
     rewarder = sil.make_rewarder(
         make_agent(),
         cost="cosine",
-        alignment="transport",
+        alignment=alignment,
         epsilon=0.05,
         num_iterations=200,
         return_scale=10.0,
@@ -69,6 +69,19 @@ def climb(state, agent, expert, steps):
 def test_the_embedding_learns_to_tell_apart():
     _, distances = climb(start(), random_frames(0, BATCH), random_frames(1, BATCH), 40)
     assert distances[-1] > distances[0] + 0.1
+
+
+def test_the_embedding_learns_alike_whatever_the_rewards_align():
+    # Samples of a batch have no order in time, by which they could be paired.
+    agent, expert = random_frames(0, BATCH), random_frames(1, BATCH)
+    key = jax.random.key(1)
+    view = AgentView(agent, jnp.zeros((BATCH, 5)), jnp.zeros((BATCH, 2)), agent)
+    batch = ExpertBatch(expert, np.zeros((BATCH, 2)))
+    transported, timed = (
+        make_rewarder(alignment).update(start(), NOBODY, view, batch, key)[1]
+        for alignment in ("transport", "time")
+    )
+    assert transported["sinkhorn/distance"] == timed["sinkhorn/distance"]
 
 
 def test_rewards_fall_where_the_embedding_has_learned():

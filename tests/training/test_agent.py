@@ -34,6 +34,15 @@ def test_its_steps_are_the_agents_and_not_updates(num_updates, expected, at_once
     np.testing.assert_allclose(schedule(num_updates), expected, rtol=1e-6, atol=1e-9)
 
 
+def test_its_longest_schedule_can_be_counted():
+    config = jaxil_config.default_config()
+    config.learning_rate_end, config.learning_rate_steps = 0.0, 10**9
+    config.update_every_steps, config.updates_per_step = 1, 100
+    schedule = agent.learning_rate(config)
+    assert callable(schedule)
+    np.testing.assert_allclose(schedule(np.int32(2**30)), 5e-5, rtol=1e-6)
+
+
 @pytest.mark.parametrize(("every", "at_once"), [(2, 1), (1, 1), (1, 4)])
 def test_updates_draw_the_noise_of_their_agent_step(every, at_once):
     config = jaxil_config.default_config()

@@ -1,5 +1,6 @@
 """The distance to the expert: zero for itself, one for random actions."""
 
+import contextlib
 import types
 
 import numpy as np
@@ -91,11 +92,11 @@ def test_a_stored_distance_is_used_if_it_verifies(tmp_path, monkeypatch):
         return Evaluation([episode(draw(5, 9))], np.array([3.0]), [])
 
     monkeypatch.setattr(expert_distance, "evaluate", play)
-    environment = types.SimpleNamespace(
-        action_spec=lambda: np.zeros(1), close=lambda: None
-    )
+    environment = types.SimpleNamespace(action_spec=lambda: np.zeros(1))
     monkeypatch.setattr(
-        expert_distance.assembly, "environment_with_seed", lambda *_: environment
+        expert_distance.assembly,
+        "environment_with_seed",
+        lambda *_: contextlib.nullcontext(environment),
     )
     path = tmp_path / "random_policy.json"
     own = demonstrations(draw(0, 21))

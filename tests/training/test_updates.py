@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from jaxil import train
-from jaxil.errors import TrainingDiverged
+from jaxil.errors import TrainingDiverged, UsageError
 from jaxil.files.tables import read_csv
 from jaxil.maths.types import Episode
 from jaxil.training import agent as agents
@@ -38,7 +38,7 @@ def _nothing_is_simulated(monkeypatch):
     )
     monkeypatch.setattr(agents, "make_agent", lambda c, *_: make_agent(c.method))
     monkeypatch.setattr(learning_curve, "plot", lambda *_, **__: None)  # slow
-    distance = types.SimpleNamespace(relative_distance=lambda episodes: None)
+    distance = types.SimpleNamespace(relative_distance=lambda *_, **__: None)
     monkeypatch.setattr(parts, "ExpertDistance", lambda *_: distance)
 
 
@@ -46,6 +46,27 @@ def make_run(folder, method="dac", **changes):
     folder.mkdir(exist_ok=True)
     config = make_config(method, **changes)
     return train.Run.make(config, folder, make_demonstrations(), print)
+
+
+def test_what_was_opened_is_closed_if_the_rest_fails(tmp_path, monkeypatch):
+    closed, pools = [], []
+    monkeypatch.setattr(Drawing, "close", lambda self: closed.append(self))
+
+    def make_pool(make, size, say):
+        del say
+        pools.append(InTurn([make() for _ in range(size)]))
+        return pools[0]
+
+    monkeypatch.setattr(assembly, "Pool", make_pool)
+
+    def fail(*_, **__):
+        raise UsageError("no logger")
+
+    monkeypatch.setattr(parts, "RunLog", fail)
+    with pytest.raises(UsageError, match="no logger"):
+        make_run(tmp_path / "run", num_environments=2)
+    assert len(set(closed)) == 2  # that of evaluations, and the pool's model
+    assert pools[0].tape == ["close"]
 
 
 def act_until(run, num_steps):
@@ -131,7 +152,7 @@ def test_several_environments_resume_bit_for_bit_and_count_as_one(tmp_path):
     changes: dict[str, Any] = {"num_environments": 2, "updates_per_dispatch": 4}
     unbroken = finished(make_run(tmp_path / "unbroken", **changes))
     table = read_csv(tmp_path / "unbroken" / "train.csv")
-    assert table["frame"].tolist() == [STEPS * n for n in range(1, EPISODES + 1)]
+    assert table["frame"].tolist() == [STEPS * n for n in (2, 2, 4, 4, 5)]
     assert table["episode"].tolist() == list(range(EPISODES))
     assert np.all(np.diff(table["seconds"]) >= 0)
     # One environment has learned since its first episode, two since their first ones.
