@@ -3,6 +3,7 @@
 import numpy as np
 
 from jaxil.demonstrations.loading import Demonstrations
+from jaxil.maths.stacking import stack_times
 from jaxil.maths.types import ExpertBatch
 from jaxil.replay.stacking import gather_stacks
 
@@ -35,8 +36,7 @@ def sample(
     steps = chosen - (ends - num_steps)[episodes]
 
     def stacks(times: np.ndarray) -> np.ndarray:
-        ages = np.arange(frame_stack - 1, -1, -1)
-        inside = np.maximum(times[:, None] - ages, 0)
+        inside = stack_times(times, frame_stack=frame_stack)
         first = episodes[:, None] * demonstrations.frames.shape[1]
         return (first + inside).astype(np.int32)
 

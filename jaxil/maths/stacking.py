@@ -2,6 +2,7 @@
 
 import chex
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxil.maths.types import Data
@@ -37,6 +38,10 @@ def stack_frames(frames: Array, *, frame_stack: int) -> Array:
 
     Source: Yarats et al. 2021, arXiv:2107.09645, sec. 3.1.
     """
-    times = jnp.arange(frames.shape[0])[:, None]
-    ages = jnp.arange(frame_stack)[::-1][None]
-    return gather_stacks(frames, jnp.maximum(times - ages, 0))
+    times = stack_times(np.arange(frames.shape[0]), frame_stack=frame_stack)
+    return gather_stacks(frames, times)
+
+
+def stack_times(times: np.ndarray, *, frame_stack: int) -> np.ndarray:
+    """Returns the times of the frames in each o_t, oldest first: [...] to [..., F]."""
+    return np.maximum(times[..., None] - np.arange(frame_stack)[::-1], 0)

@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from jaxil.maths.stacking import stack_times
 from jaxil.maths.types import Batch, Window
 from jaxil.replay.episode import require
 from jaxil.replay.ring import EpisodeRing, ring_slots
@@ -145,6 +146,6 @@ class Replay(EpisodeRing):
 
         `starts` are the first slots of the episodes.
         """
-        ages = np.arange(self._frame_stack)[::-1]
-        slots = starts[..., None] + np.maximum(steps[..., None] - ages, 0)
+        times = stack_times(steps, frame_stack=self._frame_stack)
+        slots = starts[..., None] + times
         return (slots % len(self._frames)).astype(np.int32)

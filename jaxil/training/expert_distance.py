@@ -18,6 +18,7 @@ from jaxil.demonstrations import loading
 from jaxil.environments.evaluation import evaluate
 from jaxil.files.untrusted import read_regular
 from jaxil.files.writing import write_atomically
+from jaxil.maths.stacking import stack_times
 from jaxil.maths.transport import sinkhorn_divergence
 from jaxil.maths.types import Episode
 from jaxil.networks.discriminator import Embedding
@@ -144,8 +145,7 @@ def make_random_embedding(frame_shape: tuple[int, ...], frame_stack: int) -> Any
 
     def embed(frames: np.ndarray) -> Array:
         times = np.linspace(0, len(frames) - 1, _MOMENTS).round().astype(int)
-        ages = np.arange(frame_stack - 1, -1, -1)
-        indices = np.maximum(times[:, None] - ages, 0)
+        indices = stack_times(times, frame_stack=frame_stack)
         return jnp.asarray(apply(params, gather_stacks(frames, indices)))
 
     return embed

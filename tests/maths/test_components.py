@@ -62,7 +62,7 @@ def test_there_are_no_coordinates_beyond_the_rank_of_the_rows(rank):
     sketch = jnp.zeros((8, 400))
     for part in np.split(rows, 3):
         sketch = merge(sketch, part)
-    coordinates = components.project(rows, sketch)
+    coordinates = components.project(jnp.asarray(rows), sketch)
     # A rotation of the rows: nothing is lost, and what is left is zero.
     np.testing.assert_allclose(
         np.linalg.norm(coordinates, axis=1), np.linalg.norm(rows, axis=1), rtol=1e-3

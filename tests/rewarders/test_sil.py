@@ -73,7 +73,7 @@ def test_the_embedding_learns_to_tell_apart():
 
 def test_the_embedding_learns_alike_whatever_the_rewards_align():
     # Samples of a batch have no order in time, by which they could be paired.
-    agent, expert = random_frames(0, BATCH), random_frames(1, BATCH)
+    agent, expert = (jnp.asarray(random_frames(seed, BATCH)) for seed in (0, 1))
     key = jax.random.key(1)
     view = AgentView(agent, jnp.zeros((BATCH, 5)), jnp.zeros((BATCH, 2)), agent)
     batch = ExpertBatch(expert, np.zeros((BATCH, 2)))
