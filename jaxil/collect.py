@@ -53,10 +53,15 @@ def main(argv: list[str]) -> None:
     from jaxil.machine import startup
 
     print(startup.prepare(), file=sys.stderr, flush=True)
-    functions = (_record, _record_policy, _inspect, _convert)
-    for job, function in zip(_JOBS, functions, strict=True):
-        if values[job].value:
-            function(values)
+    jobs = {
+        "workdirs": _record,
+        "policy": _record_policy,
+        "inspect": _inspect,
+        "convert": _convert,
+    }
+    for name, do in jobs.items():
+        if values[name].value:
+            do(values)
 
 
 def _problems(values: flags.FlagValues) -> list[str]:

@@ -2,55 +2,9 @@
 
     jaxil train --config=tiny:pdac,cartpole_swingup --workdir=runs/tiny
 
-The paper's methods with smaller images, networks and batches, and rendering without
-shadows. Other deviations from the paper:
-
-- The mean image of the demonstrations is subtracted and the contrast raised, since a
-  small moving body is only a few pixels at 48x48.
-- The squared pre-tanh mean is penalised, since small actors saturate permanently.
-  Beside P-SIL's small rewards this weight counts a hundred times as much: with it
-  `walker_stand` learned to lie still on state vectors, and `finger_spin` nothing in 33k
-  frames from pixels, so it is smaller there.
-- The average of the policies of about the last 1000 updates is evaluated and kept
-  (`policy_tau`), since the newest policy is worse at times. Training never uses the
-  average.
-- Exploration ends sooner, the agent updates every step and learning rates are higher,
-  since runs have to be short, and sooner still on finger_spin: training returns at 60k
-  frames on state vectors were 292 with one seed, and 175, 122 and 262 with the preset's
-  usual length. In P-DAC's short runs on the cup it ends after 20k frames. BCO and
-  BCV-LR play with noise of 0.5 throughout.
-- The replay is smaller, so that its rewards are newer, and they are recomputed
-  (`reward_refresh_steps`): those of the first episodes come from an untrained
-  discriminator and would teach the critic that random behaviour is best.
-- On the walkers and on finger_spin P-DAC's discriminator judges 32 principal components
-  of each frame instead of the critic's features, which mislead it: `walker_stand` and
-  `finger_spin` are learned from components and not from features. On
-  `ball_in_cup_catch` it is the other way round: components lose a small ball
-  (launch/results/README.md, "Learning: the ladder"). On walker_run, where only 35k
-  frames were tried, components are assumed. P-SIL compares them on finger_spin and
-  walker_walk; on `walker_stand` they mislead it too.
-- On ball_in_cup_catch P-DAC updates four times after each step. Its three seeds reached
-  80 % of the expert at 20k, 30k and 50k frames; with one update three of five did, at
-  40k to 80k, in about the same time.
-- On ball_in_cup_catch the other methods repeat actions 4 times, which halves the
-  time per frame. Rewards by transport stay as they were stored there: with P-SIL's
-  recomputed one of nine runs reached 80 % of the expert within 71k to 202k frames, with
-  stored ones all of eight within 80k to 180k; with SIL's recomputed none of three
-  within 120k, with stored ones two of three within 160k. TemporalOT and ORCA were tried
-  with stored ones alone.
-- cartpole_swingup is seen by the camera that follows the cart. DrQ-v2's shows the pole
-  one pixel wide, and not at all at the rail's ends: agents needed more frames, and then
-  kept dropping the pole. Demonstrations in pixels of another renderer may need
-  `--config.camera=0`.
-- cartpole_swingup repeats actions 4 times: with 2, a pole at 1 rad/s moves a quarter of
-  a pixel between frames, which hides its speed, and agents only learned to spin it;
-  with 8, none learned to balance it. P-DAC's gradient penalty has weight 1 there.
-  Batches of 32 halved the time of an update, but one of two seeds learned nothing in
-  260k frames.
-- Learning rates fall on cartpole_swingup, finger_spin and walker_walk: agents that have
-  learned to walk keep falling over at the first rate (457 of 961 at 500k frames), and
-  less at the last. P-SIL's rate falls half as fast on cartpole_swingup: with that and
-  the smaller penalty one seed had 843 of 856 at 280k frames, without them 373 at 300k.
+The paper's methods with smaller images, networks and batches, rendered without shadows.
+Comments say why it deviates from the paper beyond that; what was tried is measured in
+launch/results/README.md, "Learning: the ladder".
 """
 
 from typing import Any
@@ -68,20 +22,24 @@ _ALL = {
         "channels": (32, 32, 32),
         "kernel_sizes": (4, 3, 3),
         "strides": (4, 1, 1),
+        # A small moving body is a few pixels.
         "contrast": 4.0,
         "subtract_mean_image": True,
     },
     "shift_padding": 2,
     "hidden_dim": 256,
     "batch_size": 64,
+    # Runs are short.
     "update_every_steps": 1,
     "learning_rate": 3e-4,
-    "pre_tanh_penalty": 2e-3,
-    "policy_tau": 1e-3,
-    "replay_size_steps": 50_000,
-    "replay_on_device": True,  # also on CPUs, where XLA stacks faster than NumPy
     "exploration_std_steps": 50_000,
+    "pre_tanh_penalty": 2e-3,  # small actors saturate for good
+    "policy_tau": 1e-3,  # the newest policy is at times worse than the average
+    # Rewards of the first episodes come from an untrained rewarder, and would teach the
+    # critic that random behaviour is best.
+    "replay_size_steps": 50_000,
     "reward_refresh_steps": 2_500,
+    "replay_on_device": True,  # also on CPUs, where XLA stacks faster than NumPy
     "eval_every_frames": 20_000,
     "checkpoint_every_frames": 10_000,
 }
@@ -121,10 +79,14 @@ def _falling(learning_rate_steps: int) -> dict[str, Any]:
     return {"learning_rate_steps": learning_rate_steps, "learning_rate_end": 5e-5}
 
 
+# Agents that have learned keep failing at the first learning rate, so it falls.
 _TASKS = {
-    "ball_in_cup_catch": {"action_repeat": 4},
+    "ball_in_cup_catch": {"action_repeat": 4},  # half the time per frame
     "cartpole_swingup": {
+        # With 2 a pole at 1 rad/s moves a quarter of a pixel between frames.
         "action_repeat": 4,
+        # It follows the cart. DrQ-v2's shows the pole one pixel wide, and not at all at
+        # the rail's ends. Pixels of another renderer may need `--config.camera=0`.
         "camera": "lookatcart",
         "total_frames": 300_000,
         **_falling(75_000),
@@ -136,10 +98,14 @@ _TASKS = {
     },
     "walker_walk": {"total_frames": 700_000, **_falling(250_000)},
 }
+# The critic's features mislead the rewarder there; on the cup components lose the ball.
+# For P-DAC on walker_run that is assumed.
 _BY_COMPONENTS = {"num_components": 32}
+# With recomputed rewards transport rarely learns to catch.
 _STORED = {"total_frames": 200_000, "reward_refresh_steps": 0}
+# Beside P-SIL's small rewards the penalty counts a hundred times as much.
 _SMALL_PENALTY = {"pre_tanh_penalty": 2e-5}
-# With cloning too.
+# By rewarder and task, with cloning too.
 _REWARDERS = {
     ("pdac", "cartpole_swingup"): {"discriminator": {"gradient_penalty": 1.0}},
     ("pdac", "finger_spin"): {"discriminator": _BY_COMPONENTS},
@@ -156,7 +122,7 @@ _REWARDERS = {
     ("psil", "walker_walk"): {"sinkhorn": _BY_COMPONENTS, **_SMALL_PENALTY},
     ("psil", "walker_run"): _SMALL_PENALTY,
 }
-# Cloning is too slow for it.
+# Four updates learn in half the frames of one. P-DAC+C is too slow for them.
 _PDAC_ON_THE_CUP = {
     "action_repeat": 2,
     "total_frames": 50_000,

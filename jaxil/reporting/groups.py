@@ -122,13 +122,18 @@ def differing_fields(runs: Sequence[Run]) -> list[str]:
 
     Presets set some of them for each task, which a task's name already says.
     """
-    fields = {field for run in runs for field in run.config}
-    tasks = {run.task for run in runs}
+
+    def differs(field: str) -> bool:
+        values: dict[str, set[str]] = {}
+        for run in runs:
+            values.setdefault(run.task, set()).add(repr(run.config.get(field)))
+        return any(len(each) > 1 for each in values.values())
+
     return sorted(
         field
-        for field in fields
+        for field in {field for run in runs for field in run.config}
         if all(_has(run, field) and _matters(run, field) for run in runs)
-        and len({(run.task, repr(run.config.get(field))) for run in runs}) > len(tasks)
+        and differs(field)
     )
 
 
