@@ -41,7 +41,7 @@ def _quick_distance():
 @pytest.fixture
 def plain(monkeypatch):
     """Leaves out what takes long and the unbroken run shows: distances and plots."""
-    distance = types.SimpleNamespace(relative_distance=lambda episodes: None)
+    distance = types.SimpleNamespace(relative_distance=lambda *_, **__: None)
     monkeypatch.setattr(parts, "ExpertDistance", lambda *_: distance)
     monkeypatch.setattr(learning_curve, "plot", lambda *_, **__: None)
 
