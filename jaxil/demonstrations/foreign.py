@@ -139,7 +139,7 @@ def read_episodes(
 ) -> PixelEpisodes:
     """Reads the first episodes, resized with antialiasing.
 
-    `max_bytes` limits the frames of the result and every intermediate array;
+    `max_bytes` limits the arrays of the result together and every intermediate one;
     `takes_fewer` accepts fewer episodes than `num_episodes`; for the other arguments
     see `open_recording`.
 
@@ -154,11 +154,14 @@ def read_episodes(
             f"holds {recording.num_episodes} episodes, but num_episodes={num_episodes};"
             f" set demonstrations.num_episodes={recording.num_episodes}"
         )
-    episodes, longest_bytes = [], 0
+    episodes, longest_bytes = [], [0, 0, 0]
     for episode in itertools.islice(recording.episodes, num_episodes):
         episodes.append(episode)
-        longest_bytes = max(longest_bytes, episode.frames.nbytes)
-        if len(episodes) * longest_bytes > max_bytes:  # all are padded to the longest
+        arrays = (episode.frames, episode.actions, episode.rewards)
+        own_bytes = [0 if array is None else array.nbytes for array in arrays]
+        longest_bytes = [*map(max, longest_bytes, own_bytes)]
+        # All are padded to the longest.
+        if len(episodes) * sum(longest_bytes) > max_bytes:
             raise FormatError(
                 f"needs more than {max_bytes} bytes for {len(episodes)} episodes at "
                 f"{image_size}x{image_size} pixels"
@@ -193,7 +196,8 @@ def _fitted(
                 f"repeating them takes more than the {options.max_bytes} bytes allowed"
             )
         if stride != 1:
-            times = np.rint(np.arange(num_steps + 1) * stride).astype(int)
+            # Not `rint`, by which every other half would be the even one.
+            times = np.floor(np.arange(num_steps + 1) * stride + 0.5).astype(int)
             frames = frames[times]
             if actions is not None:
                 # The last step may be nearest to the last frame, which has no action.
@@ -203,6 +207,8 @@ def _fitted(
                 rewards = np.diff(sums[times]).astype(np.float32)
         height, width = stored_size or frames.shape[1:3]
         if image_size is not None and frames.shape[1:3] != (image_size, image_size):
+            num_bytes = len(frames) * image_size**2 * 3
+            options.check_bytes(f"frames at {image_size}x{image_size}", num_bytes)
             size = (image_size, image_size)
             frames = np.stack([resized(x, size, options.fit) for x in frames])
         yield PixelEpisode(frames, actions, rewards, (height, width))

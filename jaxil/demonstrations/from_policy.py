@@ -65,7 +65,10 @@ def record(
         "num_episodes": num_episodes,
         "finished": lambda episode, task_return: returns.append(task_return),
     }
-    if isinstance(environment, suite.SuiteEnvironment):
+    is_of_suite = isinstance(environment, suite.SuiteEnvironment)
+    if is_of_suite and environment.has_mocap_bodies:
+        say("The task has mocap bodies, so pixels are recorded, not states")
+    elif is_of_suite:
         try:
             arrays = playing.play(**play)
         except playing.LengthsDiffer as error:

@@ -17,6 +17,7 @@ _NUM_COLUMNS = 8  # images of an episode on the contact sheet, at most
 _NUM_ROWS = 10  # episodes on the contact sheet
 _MIN_SIDE, _MAX_SIDE = 96, 1024  # pixels of an image on the contact sheet
 _COMPARED = (16, 16)  # pixels, at which frames are compared
+_MAX_COMPARED = 2000  # frames of an episode
 _MARGIN = 4
 _CAPTION = 16
 _DEFAULT_FPS = 25.0
@@ -91,7 +92,9 @@ def inspect(
         frames, actions, rewards = episode.frames, episode.actions, episode.rewards
         height, width = episode.stored_size or frames.shape[1:3]
         if len(pictures) < _NUM_ROWS:
-            times = most_different(np.stack([_small(frame) for frame in frames]))
+            compared = _evenly(len(frames))
+            differing = most_different(np.stack([_small(frames[t]) for t in compared]))
+            times = compared[differing]
             pictures.append([Picture(int(t), frames[t].copy()) for t in times])
         if not summaries:
             video = frames
@@ -251,6 +254,11 @@ def most_different(points: np.ndarray) -> np.ndarray:
             break
         chosen.append(int(distances.argmax()))
     return np.sort(chosen)
+
+
+def _evenly(length: int) -> np.ndarray:
+    """Returns evenly spaced indices of a sequence, all of them if it is short."""
+    return np.unique(np.linspace(0, length - 1, _MAX_COMPARED).round().astype(int))
 
 
 def _small(frame: np.ndarray) -> np.ndarray:

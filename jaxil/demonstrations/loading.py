@@ -61,7 +61,7 @@ class Wanted(NamedTuple):
       stated_action_repeat: of a file of pixels that does not say it; 0 if unknown.
       takes_fewer: whether fewer episodes will do; the functions here set it where they
         are not given `num_episodes`.
-      max_bytes: memory limit for a file of pixels.
+      max_bytes: memory limit of the arrays.
     """
 
     task: str
@@ -239,6 +239,14 @@ def _open_states(
     if stride > stored.rewards.shape[1]:
         what = f"has episodes shorter than one step of action_repeat={action_repeat}"
         raise fault(path, what, "Choose a smaller action_repeat")
+    if request.observation == "pixels":
+        num_episodes, num_steps = stored.rewards.shape
+        side = request.image_size
+        num_bytes = num_episodes * (num_steps // stride + 1) * side**2 * 3
+        if num_bytes > request.max_bytes:
+            what = f"needs {num_bytes} bytes at {side}x{side} pixels, more than the "
+            way_out = "Use fewer episodes, or a smaller image_size"
+            raise fault(path, f"{what}{request.max_bytes} allowed", way_out)
     sizes = _model_sizes(task)
     if len(sizes) == 1:
         what = f"holds simulator states, which {task} cannot take"

@@ -105,6 +105,8 @@ def observe_episodes(
             }
             if distraction != "none":
                 about["distraction"] = distraction
+            if tasks.names_code(task):  # which may have changed
+                about["model"] = environment.model_digest()
             paths = [
                 _cache_path({**about, "episode": first_episode + index}, each)
                 for index, each in enumerate(of_episode)

@@ -13,8 +13,9 @@ def flat_state(observation: Any) -> np.ndarray:
 
 
 def images_in(observation: Any) -> list[np.ndarray]:
-    """Returns its RGB images."""
-    return [part for part in _parts(observation) if is_image(part)]
+    """Returns its RGB images, arrays without composer's leading axis of length 1."""
+    images = [part for part in _parts(observation) if is_image(part)]
+    return [p[0] if isinstance(p, np.ndarray) and p.ndim == 4 else p for p in images]
 
 
 def states_in(observation: Any) -> list[Any]:
@@ -23,8 +24,9 @@ def states_in(observation: Any) -> list[Any]:
 
 
 def is_image(array: Any) -> bool:
-    """Returns whether an array, or spec, is of uint8 [H, W, 3]."""
+    """Returns whether an array, or spec, is of uint8 [H, W, 3] or [1, H, W, 3]."""
     shape = getattr(array, "shape", ())
+    shape = shape[1:] if len(shape) == 4 and shape[0] == 1 else shape
     return len(shape) == 3 and shape[2] == 3 and array.dtype == np.uint8
 
 

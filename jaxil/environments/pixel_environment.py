@@ -125,12 +125,14 @@ class PixelEnvironment(dm_env.Environment):
             raise ValueError(f"action has shape {action.shape}, expected {expected}.")
         half_range = (self._action_high - self._action_low) / 2.0
         control = self._action_low + (action + 1.0) * half_range
+        # Rounded, an action of 1 may lie above the bound.
+        control = np.clip(control, self._action_low, self._action_high)
         if np.issubdtype(self._action_dtype, np.integer):
             control = np.round(control)
         control = control.astype(self._action_dtype)
         reward, discount, is_last = 0.0, 1.0, False
         for _ in range(self._action_repeat):
-            inner = _timestep("step", self._simulator.step(control))
+            inner = _timestep("step", self._simulator.step(control.copy()))
             self._seen = inner.observation
             reward += _reward(inner.reward)
             discount *= _discount(inner.discount)
@@ -215,12 +217,12 @@ class PixelEnvironment(dm_env.Environment):
         except Exception as error:  # whatever the user's task raises
             _logger.warning("the task raised an error in close(): %s", raised(error))
 
-    def _own_number(self, name: str) -> Any:
+    def _own_number(self, name: str) -> float | None:
         """Returns a number that the task may offer, None without it."""
         found = getattr(self._simulator, name, None)
         number = float(found) if isinstance(found, numbers.Real) else 0.0
         if found is None or number > 0.0:
-            return found
+            return None if found is None else number
         raise ValueError(f"has {name}={found!r}; make it a number above 0, or None")
 
     def _restart(self, seeds: np.ndarray) -> dm_env.TimeStep:

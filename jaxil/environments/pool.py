@@ -155,7 +155,7 @@ class _Worker:
             answer = self._pipe.recv()
         except BlockingIOError:
             return "stopped in the middle of an answer"
-        except (EOFError, ConnectionError):
+        except (EOFError, OSError):  # the latter if it was killed in mid-answer
             self.process.join(_EXIT_SECONDS)
             code = self.process.exitcode
             if code is not None and code < 0:
@@ -187,7 +187,7 @@ def _serve(make: Callable[[], Any], pipe: Any) -> None:
                 pipe.send(moment)
         signal.alarm(round(_EXIT_SECONDS))  # kills a driver that hangs
         environment.close()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         with contextlib.suppress(ConnectionError):
             pipe.send(raised(error))
     os._exit(0)  # without further cleanup, in which GL drivers may hang

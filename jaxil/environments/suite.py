@@ -4,6 +4,8 @@ No other module imports dm_control.
 """
 
 import functools
+import hashlib
+import importlib
 import importlib.metadata
 import logging
 import os
@@ -117,16 +119,33 @@ class SuiteEnvironment(PixelEnvironment):
         """Returns GL's name of the rendering device."""
         return self.renderer.gl_name()
 
+    @property
+    def has_mocap_bodies(self) -> bool:
+        """Whether something is moved from outside, which files of states lack."""
+        return self.physics.model.nmocap > 0
+
     def simulator_state(self) -> dict[str, np.ndarray]:
-        """Returns copies of `qpos`, `qvel` and `act`, each float64 and 1-D."""
+        """Returns copies of `qpos`, `qvel` and `act`, each float64 and 1-D.
+
+        With mocap bodies also of `mocap_pos` and `mocap_quat`, float64 and 2-D.
+        """
         data = self.physics.data
+        mocap = ("mocap_pos", "mocap_quat") if self.has_mocap_bodies else ()
         return {
             name: np.array(getattr(data, name), dtype=np.float64)
-            for name in ("qpos", "qvel", "act")
+            for name in ("qpos", "qvel", "act", *mocap)
         }
 
+    def model_digest(self) -> str:
+        """Returns a digest of the compiled model, its colours and shapes included."""
+        mujoco: Any = importlib.import_module("mujoco")
+        model = self.physics.model.ptr
+        content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+        mujoco.mj_saveModel(model, None, content)
+        return hashlib.blake2b(content.tobytes(), digest_size=16).hexdigest()
+
     def set_simulator_state(
-        self, qpos: np.ndarray, qvel: np.ndarray, act: np.ndarray
+        self, qpos: np.ndarray, qvel: np.ndarray, act: np.ndarray, **mocap: np.ndarray
     ) -> None:
         """Sets the simulation to a state from `simulator_state`.
 
@@ -138,7 +157,7 @@ class SuiteEnvironment(PixelEnvironment):
           ValueError: an array does not have the model's shape.
         """
         data = self.physics.data
-        values = {"qpos": qpos, "qvel": qvel, "act": act}
+        values = {"qpos": qpos, "qvel": qvel, "act": act, **mocap}
         for name, value in values.items():
             given, shape = np.shape(value), getattr(data, name).shape
             if given != shape:

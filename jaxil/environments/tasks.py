@@ -20,7 +20,7 @@ import numpy as np
 from dm_env import specs
 
 from jaxil import outside
-from jaxil.environments import suite
+from jaxil.environments import observations, suite
 from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.errors import Fault, UsageError, raised, unknown_name
 
@@ -28,6 +28,7 @@ LengthProblems = Callable[[int], Iterable[Fault]]
 
 _GYMNASIUM = "gymnasium:"
 _RECORDED_SIZE, _LARGEST_RECORDED = 84, 160  # larger images would fill the memory
+_LARGEST_RENDERED = 1024
 
 
 def is_of_suite(task: str) -> bool:
@@ -132,8 +133,12 @@ def make_environment(
 
 def _wrapped(simulator: Any, settings: dict[str, Any]) -> PixelEnvironment:
     """Returns an environment of one that is not the suite's; takes its settings."""
-    own_task = getattr(simulator, "task", None)
-    if isinstance(getattr(own_task, "random", None), np.random.RandomState):
+    random = getattr(getattr(simulator, "task", None), "random", None)
+    is_like_the_suites = isinstance(random, np.random.RandomState)
+    shows_itself = hasattr(simulator, "render") or (
+        is_like_the_suites and observations.images_in(simulator.observation_spec())
+    )
+    if is_like_the_suites and not shows_itself:
         return suite.wrap(simulator, **settings)
     if hasattr(simulator, "physics") and not hasattr(simulator, "render"):
         simulator = _DmControl(simulator, settings["camera"])
@@ -200,7 +205,7 @@ def timing(
 class _DmControl:
     """An environment of dm_control that is not built like the suite's, say composer's.
 
-    It can be seeded if it has a `random_state`.
+    It can be seeded if it has a `random_state`, or its task a `random`.
     """
 
     renders_any_size = True
@@ -218,12 +223,18 @@ class _DmControl:
 
     def seed(self, number: int) -> None:
         """Determines the next reset."""
-        if hasattr(self._inner, "random_state"):
-            self._inner.random_state.seed(number)
+        of_task = getattr(self._inner.task, "random", None)
+        random = getattr(self._inner, "random_state", of_task)
+        if random is not None:
+            random.seed(number)
 
     def render(self, side: int) -> np.ndarray:
         """Returns the current image, uint8 [side, side, 3]."""
-        return self._inner.physics.render(side, side, camera_id=self._camera)
+        physics = self._inner.physics  # composer's is a new one after each reset
+        frame = physics.model.vis.global_
+        frame.offwidth = max(int(frame.offwidth), _LARGEST_RENDERED)
+        frame.offheight = max(int(frame.offheight), _LARGEST_RENDERED)
+        return physics.render(side, side, camera_id=self._camera)
 
 
 class _Gymnasium(dm_env.Environment):
@@ -248,10 +259,11 @@ class _Gymnasium(dm_env.Environment):
             gymnasium.make, name, render_mode="rgb_array", disable_env_checker=True
         )
         try:
-            try:  # MuJoCo's render at any size
+            self._inner = make()
+            # MuJoCo's render at any size. To others these words may mean anything.
+            if hasattr(self._inner.unwrapped, "mujoco_renderer"):
+                self._inner.close()
                 self._inner = make(width=image_size, height=image_size)
-            except TypeError:
-                self._inner = make()
         except (gymnasium.error.Error, ImportError) as error:
             raise UsageError(
                 Fault("task", f"cannot be made: {error}", value=_GYMNASIUM + name)

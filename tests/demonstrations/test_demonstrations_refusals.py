@@ -47,6 +47,17 @@ def test_a_file_that_is_not_what_was_asked_for(path, changes, message):
         assert str(path) in str(caught.value)
 
 
+def test_images_that_would_take_too_much_memory_are_refused_before_they_are_rendered(
+    path,
+):
+    wanted = {"task": TASK, "num_episodes": 2, "action_repeat": 2, "image_size": 16}
+    needed = 2 * 5 * 16**2 * 3
+    loading.check(path, **wanted, max_bytes=needed)
+    for call in (load, loading.check):
+        with pytest.raises(DemonstrationError, match=f"needs {needed} bytes at 16x16"):
+            call(path, **wanted, max_bytes=needed - 1)
+
+
 def tampered(path, change):
     """Rewrites the file at `path` with `change` applied to its dict of arrays."""
     with np.load(path) as archive:

@@ -4,6 +4,7 @@ import contextlib
 import logging
 import os
 import pathlib
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -84,10 +85,10 @@ def test_sampling_by_time_repeats_frames_of_longer_steps(path):
     episode = make_episode(3)
     write(path, [episode], action_repeat=4)
     loaded = load(path, num_episodes=1, sampling="time")
-    # Agent steps at 0, 0.5, ... 3 of the file's; ties go to the even one.
-    nearest = [0, 0, 1, 2, 2, 2, 3]
+    # Agent steps at 0, 0.5, ... 3 of the file's; ties go to the later one.
+    nearest = [0, 1, 1, 2, 2, 3, 3]
     np.testing.assert_array_equal(loaded.frames[0], episode.frames[nearest])
-    actions = known(episode.actions)[[0, 0, 1, 2, 2, 2]]
+    actions = known(episode.actions)[[0, 1, 1, 2, 2, 2]]
     np.testing.assert_array_equal(known(loaded.actions)[0], actions)
     np.testing.assert_allclose(
         loaded.metadata["returns"], [known(episode.rewards).sum()], rtol=1e-6
@@ -95,6 +96,26 @@ def test_sampling_by_time_repeats_frames_of_longer_steps(path):
     needed = 2 * episode.frames.nbytes
     with pytest.raises(DemonstrationError, match=f"than the {needed - 1} bytes"):
         load(path, num_episodes=1, sampling="time", max_bytes=needed - 1)
+
+
+def test_tiny_frames_are_not_enlarged_beyond_the_limit(path):
+    many = make_episode(4000, size=1)
+    write(path, [many])
+    tracemalloc.start()
+    with pytest.raises(DemonstrationError, match="has frames at 64x64 of"):
+        load(path, num_episodes=1, image_size=64, max_bytes=10**6)
+    assert tracemalloc.get_traced_memory()[1] < 5e6
+    tracemalloc.stop()
+
+
+def test_actions_count_towards_the_limit(path):
+    episodes = [make_episode(6, seed=n, action_dim=10_000) for n in range(4)]
+    write(path, episodes)
+    one = episodes[0]
+    needed = 4 * sum(array.nbytes for array in one if isinstance(array, np.ndarray))
+    load(path, num_episodes=4, action_repeat=1, max_bytes=needed)
+    with pytest.raises(DemonstrationError, match="needs more than"):
+        load(path, num_episodes=4, action_repeat=1, max_bytes=needed - 1)
 
 
 def test_the_first_episodes_are_taken_and_padded_with_their_last_frames(path):
@@ -192,8 +213,8 @@ def test_a_file_that_cannot_serve(path, changes, message):
 def test_padding_counts_towards_the_limit(path):
     episodes = [make_episode(9), make_episode(1), make_episode(1)]
     write(path, episodes)
-    padded = 3 * episodes[0].frames.nbytes
-    assert load(path, num_episodes=3, max_bytes=padded).frames.nbytes == padded
+    padded = 3 * (episodes[0].frames.nbytes + 9 * 4 + 9 * 4)  # actions, rewards
+    load(path, num_episodes=3, max_bytes=padded)
     with pytest.raises(DemonstrationError, match="bytes for 3 episodes"):
         load(path, num_episodes=3, max_bytes=padded - 1)
 

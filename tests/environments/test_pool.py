@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from jaxil.environments import pool as pool_module
-from jaxil.environments.player import InProcess, Player
+from jaxil.environments.player import InProcess, Moment, Player
 from jaxil.environments.pool import Pool
 from jaxil.environments.tasks import make_environment
 from jaxil.errors import EnvironmentsFailed
@@ -42,6 +42,8 @@ class Counting:
             raise ArithmeticError("the simulation exploded")
         if action[0] == -2.0:
             os._exit(3)
+        if action[0] == -3.0:
+            sys.exit("gone")
         self.time += 1
         end = dm_env.truncation if self.time == STEPS else dm_env.transition
         return end(float(action[0]), self._observation(), 0.5)
@@ -167,6 +169,35 @@ def test_a_lost_process_is_replaced_and_its_episode_played_again(
     (line,) = lines
     assert f"environment 0 {'did ' * (sent == signal.SIGSTOP)}{said}" in line
     assert "restarts episode 0" in line
+
+
+class Large(Counting):
+    """What is seen does not fit into a pipe at once."""
+
+    def _observation(self):
+        return np.zeros(10**6, np.float32)
+
+
+def test_a_process_killed_in_mid_answer_is_replaced():
+    lines = []
+    pool = Pool(Large, 1, say=lines.append)
+    with contextlib.closing(pool):
+        pool.reset(0, 0)
+        assert isinstance(pool.receive(0), Moment)
+        (pid,) = pool.pids
+        pool.step(0, np.ones(1))
+        time.sleep(1.0)  # by then it waits for its answer to be taken
+        os.kill(pid, signal.SIGKILL)
+        assert pool.receive(0) is None
+        pool.reset(0, 0)
+    assert "was killed by SIGKILL" in lines[0]
+
+
+def test_an_exit_of_the_environment_is_its_error():
+    pool = counting_pool(1)
+    with contextlib.closing(pool), pytest.raises(EnvironmentsFailed) as caught:
+        play(pool, 1, lambda seen: np.where(seen[:, :1] == 1, -3.0, 1.0))
+    assert "environment 0 raised an error: SystemExit: gone" in str(caught.value)
 
 
 def test_an_error_of_the_environment_says_what_and_where():

@@ -18,12 +18,13 @@ from jaxil.demonstrations.readers.recording import (
     Recording,
     checked,
 )
-from jaxil.machine import child
+from jaxil.machine import child, memory
 
 _CPU_SECONDS = 20  # per item of a small file
 _BYTES_PER_SECOND = 10e6  # read and parsed on a slow machine
 _WAIT_FACTOR = 10  # of wall-clock time over CPU time
 _MEMORY_BYTES = 1024**3  # for libraries, and a decoder at 3840x2160 pixels
+_MEMORY_SHARE = 0.8  # of what is available, so that the child fails and not the machine
 _REASONS = {
     "FormatError": "{text}",
     "FileNotFoundError": "has a file that cannot be opened ({text})",
@@ -45,6 +46,11 @@ def read_in_child(
     """
     file_bytes = path.stat().st_size if path.is_file() else 0
     cpu_seconds = _CPU_SECONDS + round(file_bytes / _BYTES_PER_SECOND)
+    # A whole pickle is in memory, parts of it twice.
+    memory_bytes = _MEMORY_BYTES + 2 * options.max_bytes + 3 * file_bytes
+    if available := memory.available_bytes():
+        most = int(_MEMORY_SHARE * available)
+        memory_bytes = min(memory_bytes, max(most, _MEMORY_BYTES))
     try:
         items = child.results(
             _serve,
@@ -53,8 +59,7 @@ def read_in_child(
             options,
             seconds=_WAIT_FACTOR * cpu_seconds,
             cpu_seconds=cpu_seconds,
-            # A whole pickle is in memory, parts of it twice.
-            memory_bytes=_MEMORY_BYTES + 2 * options.max_bytes + 3 * file_bytes,
+            memory_bytes=memory_bytes,
             result_bytes=2 * options.max_bytes,
         )
         with contextlib.closing(items):
