@@ -1,7 +1,7 @@
 """Tasks of dm_control and of one's own that are legal, but not what the suite does."""
 
 import contextlib
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -169,7 +169,7 @@ def test_an_image_that_a_task_of_the_suite_observes_is_used_and_it_is_seeded():
 class Arena(gymnasium.Env):
     """An environment whose width is no number of pixels."""
 
-    metadata: Any = {"render_modes": ["rgb_array"]}
+    metadata: ClassVar[Any] = {"render_modes": ["rgb_array"]}
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
     observation_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
 
