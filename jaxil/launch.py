@@ -6,6 +6,8 @@ r"""Trains one agent: imitation from video, or DrQ-v2 on the true reward.
 Rerun the same command to resume. `python -m jaxil.launch` is the same command.
 """
 
+import os
+
 from absl import flags
 
 from jaxil import command
@@ -28,6 +30,7 @@ def main(argv: list[str]) -> int:
     from jaxil.training import assembly
 
     config = values.config
+    was_new = not os.path.exists(folder / "config.json")
     faults = [*workdir.problems(folder, config), *assembly.problems(config)]
     if faults:
         raise UsageError(faults)
@@ -39,7 +42,7 @@ def main(argv: list[str]) -> int:
     description = provenance.describe(gl_name, native=native)
     with workdir.opened(folder):
         # Another process may have begun and ended a run there in the meantime.
-        if faults := workdir.problems(folder, config):
+        if was_new and (faults := workdir.problems(folder, config)):
             raise UsageError(faults)
         try:
             workdir.write_config(folder, config, description)

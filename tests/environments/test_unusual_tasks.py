@@ -80,7 +80,7 @@ def test_the_largest_action_is_inside_bounds_that_are_no_binary_fractions(monkey
     environment.reset()
     for action in (-1.0, 1.0):
         environment.step(np.array([action]))
-        task.action_spec().validate(task.taken)
+        assert -0.1 <= task.taken[0] <= 0.3
 
 
 def test_a_task_that_changes_its_action_gets_each_frame_the_same(monkeypatch):
