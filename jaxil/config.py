@@ -78,11 +78,12 @@ FIELDS: dict[str, Field] = {
     "exploration_steps": Field(2_000, "of uniform actions; 2000 in DrQ-v2", 0, 10**9),
     "update_every_steps": Field(2, "agent steps per update; 2 in the paper", 1, 10**6),
     "updates_per_step": Field(1, "updates whenever due; 1 in the paper", 1, 100),
-    # DrQ-v2.
     "learning_rate": Field(
         1e-4, "of each network's Adam; 1e-4 in the paper", 0, 1, positive=True
     ),
-    "learning_rate_end": Field(0.0, "after learning_rate_steps", 0, 1),
+    "learning_rate_end": Field(
+        0.0, "after learning_rate_steps", 0, 1, at_most="learning_rate"
+    ),
     "learning_rate_steps": Field(
         0, "agent steps from learning_rate to learning_rate_end; 0: constant", 0, 10**9
     ),
@@ -104,7 +105,9 @@ FIELDS: dict[str, Field] = {
     ),
     "noise_clip": Field(0.3, "bound on noise in updates; 0.3 in DrQ-v2", 0.0, 2.0),
     "exploration_std_start": Field(1.0, "initial std; 1 in the paper", 0.0, 10.0),
-    "exploration_std_end": Field(0.1, "final std; 0.1 in the paper", 0.0, 10.0),
+    "exploration_std_end": Field(
+        0.1, "final std; 0.1 in the paper", 0.0, 10.0, at_most="exploration_std_start"
+    ),
     "exploration_std_steps": Field(
         500_000, "agent steps from start to end; 500000 in the paper", 1, 10**9
     ),
@@ -171,11 +174,6 @@ _WHOLE_STEPS = (
     "eval_every_frames",
     "checkpoint_every_frames",
 )
-# Schedules, by the fields of their first and last value.
-_FALLING = (
-    ("exploration_std_start", "exploration_std_end"),
-    ("learning_rate", "learning_rate_end"),
-)
 
 
 def default_config(method: str = "pdac", task: str = "cartpole_swingup") -> Config:
@@ -195,6 +193,11 @@ def defaults(method: str, task: str) -> Config:
     if taken:
         rule = f"has sections that every config has ({', '.join(sorted(taken))})"
         raise UsageError(Fault("method", rule, "rename them", method))
+    limits = {f.at_most for group in declared.sections.values() for f in group.values()}
+    numbers = {name for name, f in FIELDS.items() if type(f.default) in (int, float)}
+    if unknown := limits - numbers - {""}:
+        rule = f"has at_most={unknown.pop()!r}, which is no number of every config"
+        raise UsageError(Fault("method", rule, "name one, such as batch_size", method))
     config: Config = ml_collections.ConfigDict()
     for name, field in fields(method).items():
         group, _, leaf = name.rpartition(".")
@@ -262,6 +265,11 @@ def problems(config: Config, known_tasks: tuple[str, ...]) -> list[Fault]:
         return [*error.faults, *_problems(config, FIELDS, known_tasks)]  # pyright: ignore
     faults = list(_problems(config, known, known_tasks))
     method = methods.get(config.method)
+    first, total = config.seed_frames, config.total_frames
+    is_right = not {"seed_frames", "total_frames"} & {each.subject for each in faults}
+    if method.plays and is_right and first >= total:
+        rule = f"leaves no update in total_frames={total}"
+        faults.append(Fault("seed_frames", rule, "use fewer", first))
     if method.needs_pixels and config.observation == "state":
         rule = f"has no image, which {method.label} judges"
         faults.append(Fault("observation", rule, "use 'pixels'", "state"))
@@ -291,20 +299,13 @@ def _problems(
                 f"use {nearest}",
                 value,
             )
-    for start, end in _FALLING:
-        first, last = read(config, start), read(config, end)
-        if not {start, end} & bad and last > first:
-            yield Fault(end, f"is above {start}={first}", "it must not grow", last)
-    adversary = config.get("discriminator", {}).get("batch_size", 0)
-    if not {"batch_size", "discriminator.batch_size"} & bad and (
-        isinstance(adversary, int) and adversary > config.batch_size
-    ):
-        yield Fault(
-            "discriminator.batch_size",
-            f"is above batch_size={config.batch_size}, whose encoded samples it reuses",
-            f"use at most {config.batch_size}",
-            adversary,
-        )
+    for name, field in known.items():
+        limit = field.at_most
+        if limit and not {name, limit} & bad:
+            value, most = read(config, name), read(config, limit)
+            if value > most:
+                rule = f"is above {limit}={most}"
+                yield Fault(name, rule, f"use at most {most}", value)
     if config.observation == "state" and config.encoder.subtract_mean_image:
         yield Fault(
             "encoder.subtract_mean_image",

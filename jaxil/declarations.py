@@ -29,6 +29,8 @@ class Field(NamedTuple):
       high: largest value of a number.
       choices: of a name; empty if any text will do.
       positive: whether a number must lie above `low`, not at it.
+      at_most: a number's upper bound as another field, one that every config has;
+        empty if there is none.
     """
 
     default: Any
@@ -37,6 +39,7 @@ class Field(NamedTuple):
     high: float | None = None
     choices: tuple[str, ...] = ()
     positive: bool = False
+    at_most: str = ""
 
 
 class Variation(NamedTuple):
@@ -220,9 +223,8 @@ def _section_problems(sections: Any) -> Iterator[str]:
                 words = f"choices={field.choices!r}; give a tuple of names"
                 yield f"has {section}.{name} with {words}"
                 continue
-            if (field.low, field.high) != (None, None) and (
-                type(field.default) not in (int, float)
-            ):
+            has_range = (field.low, field.high, field.at_most) != (None, None, "")
+            if has_range and type(field.default) not in (int, float):
                 yield f"has {section}.{name} with a range, which only numbers have"
                 continue
             for fault in field_problems(f"{section}.{name}", field, field.default):

@@ -24,7 +24,7 @@ def main(argv: list[str]) -> None:
     from jaxil.machine import startup
     from jaxil.training import workdir
 
-    values = command.parse(argv, __doc__ or "", _define, workdir.flag_problems)
+    values = command.parse(argv, __doc__ or "", _define, workdir.run_problems)
     folder = workdir.from_flag(values.workdir)
 
     print(startup.prepare(), file=sys.stderr, flush=True)

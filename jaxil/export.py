@@ -43,7 +43,7 @@ def main(argv: list[str]) -> None:
     from jaxil.machine import startup
     from jaxil.training import workdir
 
-    values = command.parse(argv, __doc__ or "", _define, workdir.flag_problems)
+    values = command.parse(argv, __doc__ or "", _define, workdir.run_problems)
     folder = workdir.from_flag(values.workdir)
     output = pathlib.Path(values.output)
     startup.prepare()

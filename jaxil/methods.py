@@ -33,7 +33,12 @@ DISCRIMINATOR = {
     "learning_rate": Field(1e-4, "of its Adam; 1e-4 in ROT", 0, 1, positive=True),
     "gradient_penalty": Field(10.0, "its weight; 10 in the paper", 0, 1e6),
     "batch_size": Field(
-        128, "expert samples, and agent samples, in an update; 128 in ROT", 1, 65_536
+        128,
+        "expert samples, and as many encoded samples of the agent's batch, in an "
+        "update; 128 in ROT",
+        1,
+        65_536,
+        at_most="batch_size",
     ),
 }
 COMPONENTS = Field(

@@ -116,6 +116,32 @@ def test_all_faults_of_a_declaration_are_one_message(write):
         jaxil_config.default_config(taken, "walker_walk")
 
 
+def test_a_field_may_be_bounded_by_one_of_every_config(write):
+    old = 'methods.Field(1.0, "each reward", 1.0)'
+    new = 'methods.Field(1.0, "each reward", 1.0, at_most="num_steps")'
+    method = write("bounded", old, new)
+    config = jaxil_config.default_config(method, "cartpole_swingup")
+    config.flat.weight = 3.0
+    assert not jaxil_config.problems(config, ("cartpole_swingup",))
+    config.flat.weight = 4.0
+    (fault,) = jaxil_config.problems(config, ("cartpole_swingup",))
+    assert str(fault) == "flat.weight=4.0 is above num_steps=3; use at most 3"
+    for limit in ("num_stpes", "camera"):
+        wrong = write(f"bounded_by_{limit}", old, new.replace("num_steps", limit))
+        with pytest.raises(UsageError, match=f"'{limit}', which is no number"):
+            jaxil_config.default_config(wrong, "cartpole_swingup")
+
+
+def test_a_section_called_discriminator_has_no_rule_of_jaxils(write):
+    old = '"flat": {"weight": methods.Field(1.0, "each reward", 1.0)}'
+    new = old.replace("flat", "discriminator").replace(
+        "}", ', "batch_size": methods.Field(512, "own")}'
+    )
+    method = write("judged", old, new)
+    config = jaxil_config.default_config(method, "cartpole_swingup")
+    assert not jaxil_config.problems(config, ("cartpole_swingup",))
+
+
 def test_what_a_report_reads_of_a_declaration_is_checked_at_the_start(write):
     old = """sections={"flat": {"weight": methods.Field(1.0, "each reward", 1.0)}},"""
     new = """sections={"flat": {

@@ -35,8 +35,9 @@ _BAD_VALUES = (
     ("encoder.strides", (2, 1), ("lengths differ",)),
     ("encoder.channels", (32, 0, 32, 32), ("encoder.channels",)),
     ("sinkhorn.epsilon", 1e-5, ("sinkhorn.epsilon=1e-05", "[0.0001, 1000.0]")),
-    ("exploration_std_end", 2.0, ("must not grow",)),
-    ("learning_rate_end", 2e-4, ("is above learning_rate=0.0001", "must not grow")),
+    ("exploration_std_end", 2.0, ("is above exploration_std_start=1.0",)),
+    ("learning_rate_end", 2e-4, ("is above learning_rate=0.0001", "at most 0.0001")),
+    ("seed_frames", 5_000_000, ("leaves no update in total_frames=5000000",)),
     ("discriminator.batch_size", 512, ("at most 256",)),
     ("replay_size_steps", 10, ("replay_size_steps=10",)),
     ("demonstrations.num_episodes", 0, ("demonstrations.num_episodes=0",)),
@@ -255,6 +256,14 @@ def test_help_says_what_the_command_does(name):
     assert f"jaxil {'train' if name == 'launch' else name} --" in finished.stdout
 
 
+@pytest.mark.parametrize("name", ["evaluate", "export"])
+def test_a_folder_without_a_run_hides_no_other_fault(name, tmp_path):
+    finished = call(name, f"--workdir={tmp_path}", "--trust=nowhere", "--vdieo=1")
+    assert finished.returncode == 2
+    for words in ("holds no run", "--trust='nowhere'", "--vdieo"):
+        assert words in finished.stderr
+
+
 @pytest.mark.parametrize("name", ["evaluate", "collect"])
 def test_a_folder_without_a_run_is_said(name, tmp_path):
     flag = "workdir" if name == "evaluate" else "workdirs"
@@ -295,6 +304,7 @@ def test_a_video_that_cannot_be_written_costs_no_returns(tmp_path, monkeypatch):
     monkeypatch.setattr(film, "recorder", lambda *_: None)
     sides = [(np.zeros((2, 16, 16, 3), np.uint8), ["", ""])]
     monkeypatch.setattr(film, "sides", lambda *_, **__: sides)
+    (tmp_path / "config.json").write_text("{}")
     (tmp_path / "videos").touch()  # where its folder belongs
     finished = call("evaluate", f"--workdir={tmp_path}")
     assert finished.returncode == 2

@@ -61,6 +61,27 @@ def from_flag(value: str | None) -> pathlib.Path:
     return pathlib.Path(value)
 
 
+def run_problems(values: Any) -> Sequence[Fault | str]:
+    """Returns why there is no run in the folder of the flag `--workdir`."""
+    if found := flag_problems(values):
+        return found
+    folder = pathlib.Path(values.workdir)
+    try:
+        _read_json(folder / "config.json")
+    except OSError as error:
+        return [_holds_no_run(folder, error)]
+    except (ValueError, RecursionError):
+        pass  # damaged: `read_config` says how
+    return ()
+
+
+def _holds_no_run(workdir: pathlib.Path, error: OSError) -> str:
+    return (
+        f"workdir={str(workdir)!r} holds no run: {workdir / 'config.json'} is not "
+        f"readable ({error.strerror}); give the --workdir of a `jaxil train`"
+    )
+
+
 def output_problems(values: Any) -> Sequence[Fault | str]:
     """Returns why no run can be written to the folder of the flag `--workdir`."""
     found = flag_problems(values)
@@ -209,10 +230,7 @@ def read_config(workdir: pathlib.Path, *, imports_task: bool = True) -> Config:
             target[leaf] = tuple(value) if isinstance(value, list) else value
         return config
     except OSError as error:
-        raise UsageError(
-            f"workdir={str(workdir)!r} holds no run: {path} is not readable "
-            f"({error.strerror}); give the --workdir of a `jaxil train`"
-        ) from error
+        raise UsageError(_holds_no_run(workdir, error)) from error
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UsageError(
             f"{path} is damaged ({error}); restore it, or start in another folder"
