@@ -4,7 +4,7 @@
 
 The paper's methods with smaller images, networks and batches, rendered without shadows.
 Comments say why it deviates from the paper beyond that; what was tried is measured in
-launch/results/README.md, "Learning: the ladder".
+launch/results, in the file of each task.
 """
 
 from typing import Any
