@@ -1,8 +1,8 @@
 """The encoder in C: compiled for this machine's processor, registered with XLA.
 
 XLA's convolutions reach two thirds of a CPU core's peak and compute twice as many
-products as 3x3 kernels need: `launch/results/speed_diary.md`, changes 10 and 12. Without a C
-compiler, and on other devices, XLA's convolutions are used.
+products as 3x3 kernels need: `launch/results/speed_diary.md`, changes 10 and 12.
+Without a C compiler, and on other devices, XLA's convolutions are used.
 """
 
 import ctypes
