@@ -98,10 +98,22 @@ def test_an_example_names_what_exists(text):
         assert hasattr(importlib.import_module(module), name)
 
 
-def test_files_that_are_linked_exist():
-    links = re.findall(r"\]\((?!http)([^)#]+)", README)
-    assert links
-    assert [link for link in links if not (ROOT / link).exists()] == []
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", *sorted((ROOT / "launch/results").glob("*.md"))]
+)
+def test_files_and_headings_that_are_linked_exist(page):
+    links = re.findall(r"\]\((?!http)([^)#]*)#?([^)]*)\)", page.read_text())
+    assert links or page.name == "reliability.md"
+    for path, anchor in links:
+        target = page.parent / path if path else page
+        assert target.exists(), path
+        assert not anchor or anchor in _anchors(target), f"{path}#{anchor}"
+
+
+def _anchors(page):
+    """Returns the names that GitHub gives to a page's headings."""
+    headings = re.findall(r"^#+ (.*)", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
 
 
 def test_the_docs_are_built_without_a_warning(tmp_path):
