@@ -222,36 +222,33 @@ def _judged(what: str, value: str, advice: str, level: str = "warning") -> Findi
     return Finding(level if advice else "ok", what, value, advice)
 
 
-def _read_config(argv: list[str], said: list[str]) -> Any:
-    """Returns the checked config, the paper's without --config.
+def _findings(argv: list[str]) -> Iterator[Finding]:
+    """Reads the config, by default the paper's, and runs all checks for it."""
+    config, said = None, ""
+    try:
+        from jaxil import command
+        from jaxil import config as jaxil_config
 
-    Adds the set-up's line to `said`: only a process's first one tells what the user
-    had set.
-    """
-    from jaxil import command
-    from jaxil import config as jaxil_config
+        default = "pdac:cartpole_swingup"
+        define = functools.partial(command.define_config, default=default)
+        given = command.parse(argv, __doc__ or "", define).config
+        # Only a process's first call tells what the user had set.
+        said = startup.prepare()
+        from jaxil.environments import suite
 
-    define = functools.partial(command.define_config, default="pdac:cartpole_swingup")
-    config = command.parse(argv, __doc__ or "", define).config
-    said.append(startup.prepare())
-    from jaxil.environments import suite
-
-    faults = jaxil_config.problems(config, suite.known_tasks())
-    if faults:
-        raise UsageError(faults)
-    return config
+        if faults := jaxil_config.problems(given, suite.known_tasks()):
+            raise UsageError(faults)
+        config = given
+    except (ImportError, AttributeError) as error:  # a broken jax or simulator
+        yield Finding("fault", "packages", f"{type(error).__name__}: {error}")
+    yield Finding("ok", "set-up", said or startup.prepare())
+    yield from examine(config)
 
 
 def main(argv: list[str]) -> int:
     """Prints the findings and returns the exit status."""
-    config, num_faults, said = None, 0, []
-    try:
-        config = _read_config(argv, said)
-    except (ImportError, AttributeError) as error:  # a broken jax or simulator
-        print(Finding("fault", "packages", f"{type(error).__name__}: {error}"))
-        num_faults = 1
-    print(Finding("ok", "set-up", (said or [startup.prepare()])[0]), flush=True)
-    for finding in examine(config):
+    num_faults = 0
+    for finding in _findings(argv):
         print(finding, flush=True)
         num_faults += finding.level == "fault"
     return 1 if num_faults else 0
