@@ -10,6 +10,7 @@ rewrites it until Ctrl-C, and a browser that shows the page reloads it.
 """
 
 import contextlib
+import functools
 import os
 import pathlib
 import sys
@@ -21,18 +22,16 @@ from jaxil import command
 from jaxil.errors import UsageError
 
 _MAX_SEEDS = 10_000
-_FLAGS = ("output", "seeds", "videos", "watch", "runs", "trust")  # all take a value
 
 
 def main(argv: list[str]) -> None:
     """Runs the command."""
     values = command.parse(_named_runs(argv), __doc__ or "", _define, _problems)
-    output, roots = pathlib.Path(values.output), _roots(values)
-    _write(roots, output, values)
+    _write(values)
     with contextlib.suppress(KeyboardInterrupt):
         while values.watch:
             time.sleep(values.watch)
-            _write(roots, output, values)
+            _write(values)
 
 
 def _roots(values: flags.FlagValues) -> list[pathlib.Path]:
@@ -52,12 +51,11 @@ def _problems(values: flags.FlagValues) -> list[str]:
     return faults + folder.problems(pathlib.Path(values.output))
 
 
-def _write(
-    roots: list[pathlib.Path], output: pathlib.Path, values: flags.FlagValues
-) -> None:
+def _write(values: flags.FlagValues) -> None:
     """Reads the runs as they are now and writes their report."""
     from jaxil.reporting import assembly, runs
 
+    roots, output = _roots(values), pathlib.Path(values.output)
     found, unreadable = [], []
     for place in runs.find(roots):
         try:
@@ -97,54 +95,25 @@ def _write(
 
 def _named_runs(argv: list[str]) -> list[str]:
     """Turns the words that are not flags into --runs=WORD, for the parser."""
-    named, takes_value = argv[:1], False
-    for word in argv[1:]:
-        if word.startswith("-"):
-            takes_value = word.lstrip("-") in _FLAGS
-            named.append(word)
-        else:
-            named.append(word if takes_value else f"--runs={word}")
-            takes_value = False
-    return named
+    values = flags.FlagValues()
+    _define(values)
+    words = command.joined(argv[1:], values)
+    return argv[:1] + [w if w.startswith("-") else f"--runs={w}" for w in words]
 
 
 def _define(values: flags.FlagValues) -> None:
-    flags.DEFINE_multi_string(
-        "runs",
-        [],
-        "folder to look for runs in; the same as a word without a flag",
-        flag_values=values,
-    )
-    flags.DEFINE_string(
-        "output",
-        "report",
-        "new folder; an older report there is replaced",
-        flag_values=values,
-    )
+    about = "folder to look for runs in; the same as a word without a flag"
+    flags.DEFINE_multi_string("runs", [], about, flag_values=values)
+    about = "new folder; an older report there is replaced"
+    flags.DEFINE_string("output", "report", about, flag_values=values)
     command.define_trust(values)
-    flags.DEFINE_integer(
-        "seeds",
-        None,
-        "how many seeds each variant should have; missing ones are listed",
-        lower_bound=1,
-        upper_bound=_MAX_SEEDS,
-        flag_values=values,
-    )
-    flags.DEFINE_integer(
-        "videos",
-        1,
-        "how many of the newest videos to show for each variant on each task",
-        lower_bound=0,
-        flag_values=values,
-    )
-    flags.DEFINE_integer(
-        "watch",
-        None,
-        "seconds between rewrites of the report, which go on until Ctrl-C",
-        lower_bound=1,
-        upper_bound=86_400,
-        flag_values=values,
-    )
+    number = functools.partial(flags.DEFINE_integer, flag_values=values)
+    about = "how many seeds each variant should have; missing ones are listed"
+    number("seeds", None, about, lower_bound=1, upper_bound=_MAX_SEEDS)
+    about = "how many of the newest videos to show for each variant on each task"
+    number("videos", 1, about, lower_bound=0)
+    about = "seconds between rewrites of the report, which go on until Ctrl-C"
+    number("watch", None, about, lower_bound=1, upper_bound=86_400)
 
 
 if __name__ == "__main__":
