@@ -18,7 +18,7 @@ def write_report(
     unreadable: list[str],
     num_seeds: int | None,
     num_videos: int,
-    reload_seconds: int | None = None,
+    reload_seconds: int | None,
 ) -> None:
     """Writes index.html, figures/ and tables/ into a new folder.
 
@@ -34,27 +34,21 @@ def write_report(
       OSError: it cannot be written.
     """
     groups = make_groups(runs)
-    by_frames, frame_curves = charts.curve_sheet(
-        groups, name="learning_by_frames", over="frame"
-    )
-    by_hours, hour_curves = charts.curve_sheet(
-        groups, name="learning_by_hours", over="hours"
-    )
-    distance, distances = charts.curve_sheet(
-        groups, name="wasserstein", over="frame", column="wasserstein_to_expert"
-    )
-    finals = [f for f in map(measures.final, groups) if f is not None]
+    by_frames, frame_curves = charts.curve_sheet(groups, "frames", "learning_by_frames")
+    by_hours, hour_curves = charts.curve_sheet(groups, "hours", "learning_by_hours")
+    distance, distances = charts.curve_sheet(groups, "wasserstein", "wasserstein")
+    finals = measures.finals(groups)
     soon = measures.early_by_task(groups)
     joined = measures.early_over_tasks(soon)
     filmed, left_out = episodes.collect(groups, num_videos)
     sheets = {
         "by_frames": by_frames,
         "by_hours": by_hours,
-        "bars": charts.bar_sheet(finals, name="final_returns"),
-        "early": charts.early_sheet(soon, joined, name="sample_efficiency"),
+        "bars": charts.bar_sheet(finals, "final_returns"),
+        "early": charts.early_sheet(soon, joined),
         "distance": distance,
-        "logits": charts.logit_sheet(groups, name="logits"),
-        "metrics": charts.metric_sheet(groups, name="metrics"),
+        "logits": charts.logit_sheet(groups),
+        "metrics": charts.metric_sheet(groups),
     }
     settings = tables.settings_table(groups)
     on_page = [
@@ -66,9 +60,9 @@ def write_report(
         tables.run_table(groups),
     ]
     as_files = [
-        tables.curve_table("learning_by_frames", frame_curves, "frame"),
-        tables.curve_table("learning_by_hours", hour_curves, "hours"),
-        tables.curve_table("wasserstein", distances, "frame"),
+        tables.curve_table("learning_by_frames", frame_curves),
+        tables.curve_table("learning_by_hours", hour_curves),
+        tables.curve_table("wasserstein", distances),
     ]
     paper_figures = paper.paper_figures(groups, num_seeds)
     sentences = [*unreadable, *remarks(groups), *left_out]

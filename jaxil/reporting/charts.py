@@ -12,40 +12,40 @@ from jaxil.reporting.measures import Curve, Early, Final
 from jaxil.reporting.sheets import Panel, Sheet
 from jaxil.reporting.statistics import Estimate
 
-_RETURN = "task_return_mean"
+# Axis, column of eval.csv, and what it is, by the kind of a figure.
+_CURVES = {
+    "frames": ("frame", "task_return_mean", "task return"),
+    "hours": ("hours", "task_return_mean", "task return"),
+    "wasserstein": ("frame", "wasserstein_to_expert", "distance to the expert"),
+}
 _LOGITS = ("discriminator/expert_logit", "discriminator/agent_logit")
 _MOST_METRICS = 24  # panels in one figure; more would take long and be too small
 
 
 def curve_sheet(
-    groups: Sequence[Group], *, name: str, over: str, column: str = _RETURN
+    groups: Sequence[Group], kind: str, name: str
 ) -> tuple[Sheet | None, list[Curve]]:
     """Plots one line for each group.
 
     Args:
       groups: to show.
+      kind: "frames", "hours" or "wasserstein", see `figures.Figure`.
       name: of the files.
-      over: "frame" or "hours".
-      column: of eval.csv.
 
     Returns:
-      The sheet, or None if no group has such a column; and the curves.
+      The sheet, or None if no group has such a curve; and the curves.
     """
+    over, column, label = _CURVES[kind]
     panels, found = [], []
     for task, task_groups in tasks_of(groups).items():
-        lines = [measures.curve(group, over, column) for group in task_groups]
-        shown = [line for line in lines if line is not None]
-        if not shown:
+        lines = measures.curves(task_groups, over, column)
+        if not lines:
             continue
-        found += shown
-        if column == _RETURN:
-            label = "task return"
-            levels = [(v, f"expert {v:.0f}") for v, _ in expert_returns(task_groups)]
-        else:
-            label, levels = "distance to the expert", [(1.0, "random policy")]
-        draw = functools.partial(
-            plots.curves, lines=shown, levels=levels, over=over, name=label
-        )
+        found += lines
+        levels = [(v, f"expert {v:.0f}") for v, _ in expert_returns(task_groups)]
+        if kind == "wasserstein":
+            levels = [(1.0, "random policy")]
+        draw = functools.partial(plots.curves, lines=lines, levels=levels, name=label)
         panels.append(Panel(task, draw))
     caption = (
         "Mean over seeds; the band is its 90 % confidence interval (Student's t). A "
@@ -55,7 +55,7 @@ def curve_sheet(
     return _sheet(name, panels, [line.group for line in found], caption), found
 
 
-def bar_sheet(finals: Sequence[Final], *, name: str) -> Sheet | None:
+def bar_sheet(finals: Sequence[Final], name: str) -> Sheet | None:
     """Plots the last evaluations; None without any."""
     tasks: dict[str, list[Final]] = {}
     for final in finals:
@@ -83,14 +83,13 @@ def bar_sheet(finals: Sequence[Final], *, name: str) -> Sheet | None:
 
 
 def early_sheet(
-    tasks: Mapping[str, Sequence[Early]], joined: Sequence[Early], *, name: str
+    tasks: Mapping[str, Sequence[Early]], joined: Sequence[Early]
 ) -> Sheet | None:
     """Plots how soon each group learns; None if no run is long enough.
 
     Args:
       tasks: see `measures.early_by_task`.
       joined: see `measures.early_over_tasks`; the first panel, unless it is empty.
-      name: of the files.
     """
     found = dict(tasks)
     if joined:
@@ -108,10 +107,10 @@ def early_sheet(
         f"{measures.EARLY_FRAMES:,} environment frames: interquartile mean over seeds, "
         "its 90 % bootstrap interval and a dot for each run. Shorter runs are left out."
     )
-    return _sheet(name, panels, [], caption)
+    return _sheet("sample_efficiency", panels, [], caption)
 
 
-def logit_sheet(groups: Sequence[Group], *, name: str) -> Sheet | None:
+def logit_sheet(groups: Sequence[Group]) -> Sheet | None:
     """Plots the discriminators' logits over frames; None without any."""
     panels, shown = [], []
     for task, task_groups in tasks_of(groups).items():
@@ -131,10 +130,10 @@ def logit_sheet(groups: Sequence[Group], *, name: str) -> Sheet | None:
         "The discriminator's mean logit of the expert's (solid) and the agent's "
         "(dotted) transitions, mean over seeds; label 1 is the expert."
     )
-    return _sheet(name, panels, shown, caption)
+    return _sheet("logits", panels, shown, caption)
 
 
-def metric_sheet(groups: Sequence[Group], *, name: str) -> Sheet | None:
+def metric_sheet(groups: Sequence[Group]) -> Sheet | None:
     """Plots what the methods log about themselves over frames; None without any."""
     panels, found = [], []
     for task, task_groups in tasks_of(groups).items():
@@ -143,21 +142,15 @@ def metric_sheet(groups: Sequence[Group], *, name: str) -> Sheet | None:
         for column in columns:
             if column in _LOGITS:
                 continue  # they have a figure of their own
-            lines = [
-                measures.curve(group, "frame", column, table="training")
-                for group in task_groups
-            ]
-            shown = [line for line in lines if line is not None]
-            if shown:
-                found += [line.group for line in shown]
-                draw = functools.partial(
-                    plots.curves, lines=shown, over="frame", name=column
-                )
+            lines = measures.curves(task_groups, "frame", column, table="training")
+            if lines:
+                found += [line.group for line in lines]
+                draw = functools.partial(plots.curves, lines=lines, name=column)
                 panels.append(Panel(f"{task}: {column}", draw))
     caption = "The methods' own columns of train.csv, mean over seeds and its interval."
     if len(panels) > _MOST_METRICS:
         caption += f" The first {_MOST_METRICS} of {len(panels)}."
-    return _sheet(name, panels[:_MOST_METRICS], found, caption)
+    return _sheet("metrics", panels[:_MOST_METRICS], found, caption)
 
 
 def _bar_panel(title: str, rows: Sequence[plots.Bar], **axis: Any) -> Panel:

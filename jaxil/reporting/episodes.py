@@ -31,21 +31,13 @@ _REWARD_HEIGHT, _PLAN_HEIGHT, _ALIGNMENT_HEIGHT = 1.75, 3.4, 2.6  # inches
 
 
 class Episode(NamedTuple):
-    """One filmed episode.
-
-    Attributes:
-      group: of the run.
-      run: whose.
-      frame: environment frames of training when it was filmed.
-      video: an MP4.
-      sheet: rewards, and plan and alignment if there are any; None without them.
-    """
+    """One filmed episode."""
 
     group: Group
-    run: Run
-    frame: int
-    video: bytes
-    sheet: Sheet | None
+    run: Run  # of the group
+    frame: int  # environment frames of training when it was filmed
+    video: bytes  # an MP4
+    sheet: Sheet | None  # rewards, plan and alignment, as far as they are there
 
     @property
     def about(self) -> str:
@@ -135,7 +127,7 @@ def _sheet(path: pathlib.Path, name: str, colour: str) -> Sheet | None:
     stored = _arrays(archive.read_archive(path, max_bytes=limits))
     panels = []
     margins = plots.REWARD_MARGINS  # of all, so that their times line up
-    step_seconds = float(stored["step_seconds"]) if "step_seconds" in stored else None
+    step_seconds = float(stored.get("step_seconds", 0.0))
     imitation, task, plan = (
         stored.get(name, np.zeros(0))
         for name in ("imitation_rewards", "task_rewards", "plan")

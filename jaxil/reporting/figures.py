@@ -32,15 +32,10 @@ _MAX_SLUG = 200  # bytes; file systems take 255
 
 
 class Variant(NamedTuple):
-    """A method with what an ablation changes about it.
+    """A method with what an ablation changes about it."""
 
-    Attributes:
-      method: name of any method, known or not.
-      overrides: config fields, dotted, with their values; empty for the method itself.
-    """
-
-    method: str
-    overrides: Mapping[str, Any] = {}
+    method: str  # known or not
+    overrides: Mapping[str, Any] = {}  # values by dotted config field
 
     @property
     def label(self) -> str:
@@ -64,35 +59,15 @@ class Variant(NamedTuple):
 
 
 class Figure(NamedTuple):
-    """One figure of the paper.
-
-    Attributes:
-      number: in the paper.
-      title: what it shows.
-      kind: "frames" and "hours": curves of the return over them; "wasserstein":
-        curves of the distance to the expert over frames; "bars": the mean over the
-        last ten episodes.
-      variants: what it compares.
-      is_ablation: whether the paper gave it the shorter budget.
-    """
+    """One figure of the paper."""
 
     number: int
     title: str
+    # Curves of the return over frames or hours, or of the distance to the expert over
+    # frames; bars: the mean over the last ten episodes.
     kind: Literal["frames", "hours", "wasserstein", "bars"]
     variants: tuple[Variant, ...]
-    is_ablation: bool
-
-
-class Study(NamedTuple):
-    """What one name of `jaxil sweep --ablation` trains.
-
-    Attributes:
-      variants: what it compares.
-      has_short_budget: whether the paper's preset stops after ABLATION_FRAMES.
-    """
-
-    variants: tuple[Variant, ...]
-    has_short_budget: bool
+    has_short_budget: bool  # as the paper's ablations: ABLATION_FRAMES
 
 
 def _product(names: str, *changes: Mapping[str, Any]) -> tuple[Variant, ...]:
@@ -129,11 +104,11 @@ FIGURES = {
 }
 
 
-def studies() -> dict[str, Study]:
+def studies() -> dict[str, Figure]:
     """Returns what `jaxil sweep --ablation` offers, by name.
 
-    Those are the paper's figures, and `video_alone`: every method that plays and needs
-    no actions, from 1, 10 and 50 demonstrations.
+    Those are the paper's figures, and `video_alone`, which is none: every method that
+    plays and needs no actions, from 1, 10 and 50 demonstrations.
     """
     alone = [
         name
@@ -142,21 +117,14 @@ def studies() -> dict[str, Study]:
         and method.uses_demonstrations
         and method.sees_actions is not True
     ]
-    paper = {
-        f"figure{number}": Study(figure.variants, figure.is_ablation)
-        for number, figure in FIGURES.items()
-    }
-    return {**paper, "video_alone": Study(_product(" ".join(alone), *_NUMBERS), True)}
+    variants = _product(" ".join(alone), *_NUMBERS)
+    paper = {f"figure{number}": figure for number, figure in FIGURES.items()}
+    return {**paper, "video_alone": Figure(0, "video alone", "frames", variants, True)}
 
 
 def declaration(name: str) -> Method:
     """Returns a method's declaration; of one that is not installed, its name only."""
-    return _installed(name) or Method(name=name, label=name, about="not installed here")
-
-
-def is_installed(method: str) -> bool:
-    """Returns whether a method's declaration can be read."""
-    return _installed(method) is not None
+    return installed(name) or Method(name=name, label=name, about="not installed here")
 
 
 def variant_of(config: Mapping[str, Any]) -> Variant:
@@ -177,7 +145,8 @@ def variant_of(config: Mapping[str, Any]) -> Variant:
     return Variant(config["method"], overrides)
 
 
-def _installed(name: str) -> Method | None:
+def installed(name: str) -> Method | None:
+    """Returns a method's declaration, if it can be read."""
     # Names come from files of runs: nothing is imported that only they name.
     if not methods.is_trusted(name):
         return None

@@ -27,17 +27,11 @@ _DARKEST, _BRIGHTEST = 0.27, 0.85  # visible on dark and on bright pages
 
 
 class Look(NamedTuple):
-    """How a group is plotted.
+    """How a group is plotted."""
 
-    Attributes:
-      colour: as "#rrggbb".
-      dashes: lengths on and off, in line widths; empty for a solid line.
-      marker: of single points, in Matplotlib's letters.
-    """
-
-    colour: str
-    dashes: tuple[float, ...]
-    marker: str
+    colour: str  # as "#rrggbb"
+    dashes: tuple[float, ...]  # lengths on and off, in line widths; empty: solid
+    marker: str  # of single points, in Matplotlib's letters
 
     @property
     def line(self) -> Any:
@@ -46,26 +40,19 @@ class Look(NamedTuple):
 
 
 class Group(NamedTuple):
-    """Seeds of one variant on one task, with the same settings.
-
-    Attributes:
-      task: such as "walker_walk".
-      variant: the method with what an ablation changed.
-      settings: those that differ from the paper's and, on some task, among the runs of
-        the same variant, such as "action_repeat 4".
-      label: the variant with its settings, or with a letter in their place where that
-        takes more than three words; the same on every task. The name of its method is
-        added where another has the same label.
-      look: the same for all groups of this label.
-      runs: by seed and folder, at least one.
-    """
+    """Seeds of one variant on one task, with the same settings."""
 
     task: str
     variant: figures.Variant
+    # Those that differ from the paper's and, on some task, among the runs of the same
+    # variant, such as "action_repeat 4".
     settings: tuple[str, ...]
+    # The variant with its settings, or with a letter in their place where that takes
+    # more than three words; the same on every task. The name of its method is added
+    # where another has the same label.
     label: str
-    look: Look
-    runs: tuple[Run, ...]
+    look: Look  # the same for all groups of this label
+    runs: tuple[Run, ...]  # by seed and folder, at least one
 
     @property
     def measured(self) -> tuple[Run, ...]:
@@ -201,7 +188,7 @@ def _has(run: Run, field: str) -> bool:
     # An older run may lack a field that its method has today.
     method = run.variant.method
     return field in run.config or (
-        figures.is_installed(method) and field in jaxil_config.fields(method)
+        figures.installed(method) is not None and field in jaxil_config.fields(method)
     )
 
 

@@ -1,7 +1,7 @@
 """Metrics of a group: curves, last returns, and sample efficiency."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,65 +17,54 @@ _MAX_POINTS = 400  # of a curve; a figure's width shows no more
 
 
 class Curve(NamedTuple):
-    """The mean of a group's seeds over frames or hours.
-
-    Attributes:
-      group: whose.
-      x: frames or hours, rising. Shape [X].
-      mean: with Student's interval, NaN where one seed is left. Shapes [X].
-      count: how many seeds have a value there. Shape [X].
-      num_runs: how many seeds have any of it.
-    """
+    """The mean of a group's seeds over frames or hours."""
 
     group: Group
-    x: np.ndarray
-    mean: Estimate
-    count: np.ndarray
-    num_runs: int
+    over: str  # "frame" or "hours"
+    x: np.ndarray  # rising. Shape [X]
+    mean: Estimate  # with Student's interval, NaN where one seed is left. Shapes [X]
+    count: np.ndarray  # how many seeds have a value there. Shape [X]
+    num_runs: int  # how many seeds have any of it
 
 
 class Final(NamedTuple):
-    """The last evaluations of a group.
-
-    Attributes:
-      group: whose.
-      returns: of each measured run, in their order. Shape [S], S >= 1.
-      mean: with Student's interval.
-      expert: the mean return of the runs' own demonstrations; NaN without any.
-      shares: each return as a share of that run's own expert's, NaN without. Shape [S].
-    """
+    """The last evaluations of a group."""
 
     group: Group
-    returns: np.ndarray
-    mean: Estimate
-    expert: float
-    shares: np.ndarray
+    returns: np.ndarray  # of each measured run, in their order. Shape [S], S >= 1
+    mean: Estimate  # with Student's interval
+    expert: float  # mean return of the runs' own demonstrations; NaN without any
+    shares: np.ndarray  # of the return of each run's own expert, NaN without. Shape [S]
 
 
 class Early(NamedTuple):
-    """How soon a group learns.
+    """How soon a group learns."""
 
-    Attributes:
-      group: whose; joined over tasks, that of the first task.
-      shares: `early_share` of each run that has one. Shape [S], S >= 1.
-      iqm: their interquartile mean.
-    """
-
-    group: Group
-    shares: np.ndarray
-    iqm: Estimate
+    group: Group  # joined over tasks, that of the first task
+    shares: np.ndarray  # mean share of the expert's return, see `early`. Shape [S >= 1]
+    iqm: Estimate  # the interquartile mean of the shares
 
 
-def curve(group: Group, x: str, y: str, *, table: str = "evaluation") -> Curve | None:
+def curves(
+    groups: Iterable[Group], over: str, column: str, *, table: str = "evaluation"
+) -> list[Curve]:
+    """Returns the curves of those groups that have one; see `curve`."""
+    found = (curve(group, over, column, table=table) for group in groups)
+    return [line for line in found if line is not None]
+
+
+def curve(
+    group: Group, over: str, column: str, *, table: str = "evaluation"
+) -> Curve | None:
     """Joins the seeds of a group; None if none has such a column.
 
     Args:
       group: the seeds.
-      x: "frame" or "hours".
-      y: a column, such as "task_return_mean".
+      over: "frame" or "hours".
+      column: such as "task_return_mean".
       table: "evaluation" or "training".
     """
-    pieces = [series(getattr(run, table), x, y) for run in group.runs]
+    pieces = [_series(getattr(run, table), over, column) for run in group.runs]
     found = [piece for piece in pieces if len(piece[0])]
     if not found:
         return None
@@ -84,33 +73,30 @@ def curve(group: Group, x: str, y: str, *, table: str = "evaluation") -> Curve |
         shown = np.linspace(0, len(joined) - 1, _MAX_POINTS).round().astype(int)
         joined, values = joined[shown], values[:, shown]
     count = (~np.isnan(values)).sum(axis=0)
-    return Curve(group, joined, statistics.mean_interval(values), count, len(found))
+    mean = statistics.mean_interval(values)
+    return Curve(group, over, joined, mean, count, len(found))
 
 
-def series(table: Table, x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a column over frames or hours, x strictly rising; empty if not there."""
-    column = "seconds" if x == "hours" else x
-    if column not in table or y not in table:
-        return np.zeros(0), np.zeros(0)
-    good = np.isfinite(table[column]) & np.isfinite(table[y])
-    position, first = np.unique(table[column][good], return_index=True)
-    return position / 3600.0 if x == "hours" else position, table[y][good][first]
-
-
-def final(group: Group) -> Final | None:
-    """Returns the last evaluations; None before the first one."""
-    if not group.measured:
-        return None
-    returns = np.array([run.returns[-1] for run in group.measured])
-    experts = np.array([run.expert_return for run in group.measured])
-    shares = returns / np.where(experts > 0, experts, np.nan)
-    mean = statistics.mean_interval(returns)
-    return Final(group, returns, mean, float(np.mean(experts)), shares)
+def finals(groups: Iterable[Group]) -> list[Final]:
+    """Returns the last evaluations of those groups that have any."""
+    found = []
+    for group in groups:
+        if not group.measured:
+            continue
+        returns = np.array([run.returns[-1] for run in group.measured])
+        experts = np.array([run.expert_return for run in group.measured])
+        shares = returns / np.where(experts > 0, experts, np.nan)
+        mean = statistics.mean_interval(returns)
+        found.append(Final(group, returns, mean, float(np.mean(experts)), shares))
+    return found
 
 
 def early(group: Group) -> Early | None:
-    """Returns how soon a group learns; None if none of its runs is long enough."""
-    shares = np.array([early_share(run) for run in group.measured])
+    """Returns the mean shares of the expert's return up to EARLY_FRAMES.
+
+    None if no run is long enough and has an expert of positive return.
+    """
+    shares = np.array([_early_share(run) for run in group.measured])
     shares = shares[np.isfinite(shares)]
     if not len(shares):
         return None
@@ -144,26 +130,32 @@ def early_over_tasks(tasks: Mapping[str, Sequence[Early]]) -> list[Early]:
     return found
 
 
-def arrivals(run: Run, x: str) -> list[float]:
+def arrivals(run: Run, over: str) -> list[float]:
     """Returns when a run first reached each of LEVELS of its expert; NaN for never.
 
     Args:
-      run: any; a run reaches none without an expert of positive return, of which there
-        would be no shares.
-      x: "frame" or "hours".
+      run: reaches none without an expert of positive return.
+      over: "frame" or "hours".
     """
-    position, returns = series(run.evaluation, x, "task_return_mean")
+    position, returns = _series(run.evaluation, over, "task_return_mean")
     expert = run.expert_return if run.expert_return > 0 else float("nan")
     levels = [share * expert for share in LEVELS]
     return [statistics.first_reaching(position, returns, level) for level in levels]
 
 
-def early_share(run: Run) -> float:
-    """Returns a run's mean share of the expert's return up to EARLY_FRAMES.
-
-    NaN if it is shorter, or without an expert of positive return.
-    """
-    frames, returns = series(run.evaluation, "frame", "task_return_mean")
+def _early_share(run: Run) -> float:
     if not run.expert_return > 0:
         return float("nan")
+    frames, returns = _series(run.evaluation, "frame", "task_return_mean")
     return statistics.mean_until(frames, returns / run.expert_return, EARLY_FRAMES)
+
+
+def _series(table: Table, over: str, column: str) -> tuple[np.ndarray, np.ndarray]:
+    """Returns x, strictly rising, and a column there; empty if it is missing."""
+    x = "seconds" if over == "hours" else over
+    if x not in table or column not in table:
+        return np.zeros(0), np.zeros(0)
+    good = np.isfinite(table[x]) & np.isfinite(table[column])
+    position, first = np.unique(table[x][good], return_index=True)
+    values = table[column][good][first]
+    return position / 3600.0 if over == "hours" else position, values

@@ -9,19 +9,12 @@ from jaxil.reporting.sheets import Sheet
 
 
 class PaperFigure(NamedTuple):
-    """One figure of the paper, as far as there are runs for it.
-
-    Attributes:
-      figure: which.
-      sheet: the plots; None without two methods or variants to compare.
-      lacks: what is missing; empty if nothing is.
-      command: trains the missing runs.
-    """
+    """One figure of the paper, as far as there are runs for it."""
 
     figure: Figure
-    sheet: Sheet | None
-    lacks: str
-    command: str
+    sheet: Sheet | None  # None without two methods or variants to compare
+    lacks: str  # what is missing; empty if nothing is
+    command: str  # trains the missing runs
 
 
 def paper_figures(groups: list[Group], num_seeds: int | None) -> list[PaperFigure]:
@@ -42,9 +35,9 @@ def _figure(groups: list[Group], figure: Figure, num_seeds: int | None) -> Paper
         if group.task in figures.TASKS and group.variant in figure.variants
     ]
     variants = [group.variant for group in own if group.measured]
-    # An ablation needs more than plain methods.
+    # Ablations, which have the short budget, need more than plain methods.
     is_shown = len({variant.label for variant in variants}) > 1 and (
-        not figure.is_ablation or any(variant.overrides for variant in variants)
+        not figure.has_short_budget or any(variant.overrides for variant in variants)
     )
     sheet = _sheet(figure, own) if is_shown else None
     command = f"jaxil sweep --ablation=figure{figure.number}"
@@ -79,11 +72,5 @@ def _num_finished(
 def _sheet(figure: Figure, groups: list[Group]) -> Sheet | None:
     name = f"figure{figure.number:02d}"
     if figure.kind == "bars":
-        finals = [f for f in map(measures.final, groups) if f is not None]
-        return charts.bar_sheet(finals, name=name)
-    over, column = {
-        "frames": ("frame", "task_return_mean"),
-        "hours": ("hours", "task_return_mean"),
-        "wasserstein": ("frame", "wasserstein_to_expert"),
-    }[figure.kind]
-    return charts.curve_sheet(groups, name=name, over=over, column=column)[0]
+        return charts.bar_sheet(measures.finals(groups), name)
+    return charts.curve_sheet(groups, figure.kind, name)[0]

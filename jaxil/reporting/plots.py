@@ -4,6 +4,10 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.collections import LineCollection
+from matplotlib.colors import PowerNorm
+from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from jaxil.reporting.groups import Group
 from jaxil.reporting.measures import Curve
@@ -29,16 +33,14 @@ def curves(
     lines: Sequence[Curve],
     *,
     levels: Sequence[tuple[float, str]] = (),
-    over: str,
     name: str,
 ) -> None:
     """Plots the mean of each group with its interval.
 
     Args:
       axes: Matplotlib's.
-      lines: at least one.
+      lines: at least one, all over the same.
       levels: heights to mark with a dashed line, and their names; highest first.
-      over: "frame" or "hours".
       name: of the vertical axis.
     """
     for line in lines:
@@ -64,25 +66,18 @@ def curves(
             fontsize=7.5,
             alpha=0.85,
         )
-    _horizontal(axes, max(float(line.x[-1]) for line in lines), over)
+    _horizontal(axes, lines)
     axes.set_ylabel(name)
     axes.grid(axis="y", alpha=0.16, lw=0.6, color=INK)
 
 
 class Bar(NamedTuple):
-    """One bar.
+    """One bar."""
 
-    Attributes:
-      group: gives it name and colour.
-      values: a dot each. Shape [S], S >= 1.
-      estimate: its length, and the interval.
-      is_hatched: such as for unfinished runs.
-    """
-
-    group: Group
-    values: np.ndarray
-    estimate: Estimate
-    is_hatched: bool = False
+    group: Group  # gives it name and colour
+    values: np.ndarray  # a dot each. Shape [S], S >= 1
+    estimate: Estimate  # its length, and the interval
+    is_hatched: bool = False  # such as for unfinished runs
 
 
 def bars(
@@ -153,7 +148,7 @@ def logits(axes: Any, pairs: Sequence[tuple[Curve, Curve]]) -> None:
         axes.plot(expert.x, expert.mean.value, color=colour, lw=1.4)
         axes.plot(agent.x, agent.mean.value, color=colour, lw=1.4, ls=(0, (1, 1.2)))
     axes.axhline(0.0, color=INK, lw=0.7, alpha=0.5)
-    _horizontal(axes, max(float(pair[0].x[-1]) for pair in pairs), "frame")
+    _horizontal(axes, [expert for expert, _ in pairs])
     axes.set_ylabel("mean logit")
     axes.grid(axis="y", alpha=0.16, lw=0.6, color=INK)
 
@@ -163,7 +158,7 @@ def rewards(
     imitation: np.ndarray,
     task: np.ndarray,
     colour: str,
-    step_seconds: float | None,
+    step_seconds: float,
 ) -> None:
     """Plots the rewards of one episode.
 
@@ -172,7 +167,7 @@ def rewards(
       imitation: what the agent learns from. Shape [T].
       task: the true reward, which it never sees. Shape [T] or empty.
       colour: of the imitation reward.
-      step_seconds: of an agent step; None if unknown.
+      step_seconds: of an agent step; 0 if unknown.
     """
     step, unit = _time(step_seconds)
     times = step * np.arange(max(len(imitation), len(task)))
@@ -188,16 +183,14 @@ def rewards(
         other.spines[["top", "left"]].set_visible(False)
 
 
-def plan(axes: Any, weights: np.ndarray, step_seconds: float | None) -> None:
+def plan(axes: Any, weights: np.ndarray, step_seconds: float) -> None:
     """Plots a transport plan: which expert frames each agent frame is matched with.
 
     Args:
       axes: Matplotlib's.
       weights: at least 0. Shape [T + 1, N + 1].
-      step_seconds: of an agent step; None if unknown.
+      step_seconds: of an agent step; 0 if unknown.
     """
-    from matplotlib.colors import PowerNorm
-
     shares = _shares(weights)
     step, unit = _time(step_seconds)
     image = axes.imshow(
@@ -220,7 +213,7 @@ def alignment(
     weights: np.ndarray,
     agent_strip: np.ndarray,
     expert_strip: np.ndarray,
-    step_seconds: float | None,
+    step_seconds: float,
 ) -> None:
     """Plots a transport plan as lines between two film strips.
 
@@ -232,11 +225,8 @@ def alignment(
       weights: at least 0. Shape [T + 1, N + 1].
       agent_strip: evenly spaced frames from first to last, uint8 [n, H, W, 3].
       expert_strip: the same for the expert.
-      step_seconds: of an agent step; None if unknown.
+      step_seconds: of an agent step; 0 if unknown.
     """
-    from matplotlib import colormaps
-    from matplotlib.collections import LineCollection
-
     shares = _shares(weights)
     step, unit = _time(step_seconds)
     ends = [step * size for size in shares.shape]
@@ -267,7 +257,7 @@ def _shares(weights: np.ndarray) -> np.ndarray:
     return weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
 
 
-def _time(step_seconds: float | None) -> tuple[float, str]:
+def _time(step_seconds: float) -> tuple[float, str]:
     """Returns the length of a step on a time axis, and the end of the axis's name."""
     return (step_seconds, ", seconds") if step_seconds else (1.0, " step")
 
@@ -302,12 +292,11 @@ def _vertical(heights: np.ndarray, bands: np.ndarray) -> tuple[float, float]:
     return bottom, top + 0.08 * size
 
 
-def _horizontal(axes: Any, right: float, over: str) -> None:
-    from matplotlib.ticker import EngFormatter, MaxNLocator
-
+def _horizontal(axes: Any, lines: Sequence[Curve]) -> None:
+    right = max(float(line.x[-1]) for line in lines)
     axes.set_xlim(0, 1.02 * right if right > 0 else 1.0)
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
-    if over == "frame":
+    if lines[0].over == "frame":
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.set_xlabel("environment frames")
     else:

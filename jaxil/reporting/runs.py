@@ -26,7 +26,7 @@ LARGEST = 1e15
 _MAX_REASON = 200  # characters of a file's fault that are shown
 _MAX_CONFIG_BYTES = 10**7
 
-Table = Mapping[str, np.ndarray]
+Table = Mapping[str, np.ndarray]  # by column
 
 
 class UnreadableError(Exception):
@@ -34,31 +34,20 @@ class UnreadableError(Exception):
 
 
 class Run(NamedTuple):
-    """One run, as read from its folder.
-
-    Attributes:
-      folder: where it is.
-      name: the folder as text.
-      config: its method's settings by dotted name, with defaults for missing ones.
-      variant: its method with what an ablation changed.
-      evaluation: eval.csv by column, rising frames, finite returns. Shapes [E].
-      training: train.csv by column, rising frames. Shapes [R].
-      device: what it computed on.
-      remarks: warnings, one sentence each.
-    """
+    """One run, as read from its folder."""
 
     folder: pathlib.Path
-    name: str
-    config: Mapping[str, Any]
+    name: str  # the folder as text
+    config: Mapping[str, Any]  # by dotted name, with defaults for missing settings
     variant: figures.Variant
-    evaluation: Table
-    training: Table
-    device: str
-    remarks: tuple[str, ...]
+    evaluation: Table  # eval.csv, rising frames, finite returns. Shapes [E]
+    training: Table  # train.csv, rising frames. Shapes [R]
+    device: str  # what it computed on
+    remarks: tuple[str, ...]  # warnings, one sentence each
 
     @property
     def task(self) -> str:
-        """The task, such as "walker_walk"."""
+        """Such as "walker_walk"."""
         return self.config["task"]
 
     @property
@@ -74,12 +63,12 @@ class Run(NamedTuple):
     @property
     def frames(self) -> float:
         """Environment frames so far, by either table; 0 if both are empty."""
-        return max(self._last("frame"), 0.0)
+        return self._last("frame")
 
     @property
     def seconds(self) -> float:
         """Seconds so far; 0 if both tables are empty."""
-        return max(self._last("seconds"), 0.0)
+        return self._last("seconds")
 
     @property
     def frames_per_second(self) -> float:
@@ -112,7 +101,7 @@ class Run(NamedTuple):
     def _last(self, column: str) -> float:
         both = (self.evaluation, self.training)
         last = [t[column][-1] for t in both if column in t and len(t[column])]
-        return float(np.max(last, initial=-np.inf, where=np.isfinite(last)))
+        return float(np.max(last, initial=0.0, where=np.isfinite(last)))
 
 
 def find(roots: Iterable[pathlib.Path]) -> list[pathlib.Path]:
@@ -147,7 +136,7 @@ def read(folder: pathlib.Path) -> Run:
     defaults = defaults_of(nested["method"], nested["task"])
     config = {name: _setting(nested, name, value) for name, value in defaults.items()}
     remarks: list[str] = []
-    if not figures.is_installed(nested["method"]):
+    if figures.installed(nested["method"]) is None:
         name = nested["method"]
         why = "not installed here"
         if ":" in name and not methods.is_trusted(name):
@@ -180,7 +169,7 @@ def defaults_of(method: str, task: str) -> dict[str, Any]:
 
     For a method that is not installed, only the settings that all methods have.
     """
-    if figures.is_installed(method):
+    if figures.installed(method) is not None:
         known, names = method, jaxil_config.fields(method)
     else:
         known, names = next(iter(methods.known())), jaxil_config.FIELDS

@@ -6,6 +6,11 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import matplotlib
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
 from jaxil.reporting.groups import Look
 from jaxil.reporting.plots import INK
 
@@ -41,34 +46,20 @@ _SETTINGS: dict[Any, Any] = {
 
 
 class Panel(NamedTuple):
-    """One plot.
+    """One plot."""
 
-    Attributes:
-      title: such as the task.
-      draw: plots it onto Matplotlib's axes.
-      height: in inches; None for that of curves.
-      margins: left and right of the axes, in inches.
-    """
-
-    title: str
-    draw: Callable[[Any], None]
-    height: float | None = None
-    margins: tuple[float, float] = _MARGINS
+    title: str  # such as the task
+    draw: Callable[[Any], None]  # onto Matplotlib's axes
+    height: float | None = None  # in inches; None for that of curves
+    margins: tuple[float, float] = _MARGINS  # left and right of the axes, in inches
 
 
 class Sheet(NamedTuple):
-    """A figure.
+    """A figure."""
 
-    Attributes:
-      name: of its files.
-      panels: at least one.
-      legend: labels with their looks; empty where the panels name their groups.
-      caption: a sentence or two.
-    """
-
-    name: str
-    panels: tuple[Panel, ...]
-    legend: tuple[tuple[str, Look], ...] = ()
+    name: str  # of its files
+    panels: tuple[Panel, ...]  # at least one
+    legend: tuple[tuple[str, Look], ...] = ()  # empty where panels name their groups
     caption: str = ""
 
 
@@ -80,7 +71,7 @@ def inline_svg(panel: Panel, prefix: str, columns: int) -> str:
       prefix: of all ids in it, unique on the page.
       columns: panels beside each other on a wide page.
     """
-    with _context({"svg.fonttype": "none"}):
+    with matplotlib.rc_context({**_SETTINGS, "svg.fonttype": "none"}):
         figure, axes = _figure([panel], title=0.0, beside=columns)
         panel.draw(axes[0])
         text = _saved(figure, "svg", transparent=True).decode()
@@ -97,7 +88,7 @@ def inline_svg(panel: Panel, prefix: str, columns: int) -> str:
 
 def write(sheet: Sheet, folder: pathlib.Path) -> None:
     """Writes NAME.png and NAME.svg."""
-    with _context({"svg.fonttype": "path"}):
+    with matplotlib.rc_context({**_SETTINGS, "svg.fonttype": "path"}):
         figure, axes = _figure(
             sheet.panels, sheet.legend, title=_TITLE, beside=len(sheet.panels)
         )
@@ -106,12 +97,6 @@ def write(sheet: Sheet, folder: pathlib.Path) -> None:
             ax.set_title(panel.title)
         for kind in ("png", "svg"):
             (folder / f"{sheet.name}.{kind}").write_bytes(_saved(figure, kind))
-
-
-def _context(more: dict[Any, Any]) -> Any:
-    import matplotlib
-
-    return matplotlib.rc_context({**_SETTINGS, **more})
 
 
 def _figure(
@@ -125,11 +110,6 @@ def _figure(
 
     `title` is the height of a panel's title; `beside` how many panels share a row.
     """
-    # Not pyplot: a separate Figure needs no display and leaves no global state.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
-
     columns = min(_COLUMNS, len(panels))
     is_wide = beside < _COLUMNS
     each_width = _FEWER_WIDTH / beside if is_wide else _WIDTH
@@ -141,6 +121,7 @@ def _figure(
     firsts = range(0, len(panels), columns)
     rows = [title + max(heights[k : k + columns]) for k in firsts]
     width, height = each_width * columns, sum(rows) + legend_height
+    # Not pyplot: a separate Figure needs no display and leaves no global state.
     figure = Figure(figsize=(width, height), dpi=150)
     FigureCanvasAgg(figure)
     axes = []

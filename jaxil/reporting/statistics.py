@@ -6,21 +6,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-CONFIDENCE = 0.9  # of the paper's shaded areas
+_CONFIDENCE = 0.9  # of the paper's shaded areas
 _NUM_RESAMPLES = 2000
 _SEED = 0  # of the resampling, so that the same numbers give the same interval
 
 
 class Estimate(NamedTuple):
-    """A number, or an array of them, with its interval.
+    """A number, or an array of them, with its interval."""
 
-    Attributes:
-      value: the estimate; NaN without data.
-      low, high: the interval's ends; NaN where there is too little data for one.
-    """
-
-    value: np.ndarray
-    low: np.ndarray
+    value: np.ndarray  # NaN without data
+    low: np.ndarray  # the interval's ends; NaN where there is too little data for one
     high: np.ndarray
 
 
@@ -37,7 +32,7 @@ def mean_interval(values: np.ndarray) -> Estimate:
     count = present.count(axis=0)
     mean = np.ma.filled(present.mean(axis=0), np.nan)
     deviation = np.ma.filled(present.std(axis=0, ddof=1), np.nan)
-    quantile = stats.t.ppf((1.0 + CONFIDENCE) / 2.0, np.maximum(count - 1, 1))
+    quantile = stats.t.ppf((1.0 + _CONFIDENCE) / 2.0, np.maximum(count - 1, 1))
     half = quantile * deviation / np.sqrt(np.maximum(count, 1))
     return Estimate(mean, mean - half, mean + half)
 
@@ -69,7 +64,7 @@ def interquartile_interval(strata: Sequence[np.ndarray]) -> Estimate:
         several,
         statistic,
         n_resamples=_NUM_RESAMPLES,
-        confidence_level=CONFIDENCE,
+        confidence_level=_CONFIDENCE,
         method="percentile",
         rng=np.random.default_rng(_SEED),
         vectorized=True,
@@ -117,9 +112,8 @@ def mean_until(x: np.ndarray, y: np.ndarray, end: float) -> float:
         return float("nan")
     x, y = np.concatenate([[0.0], x]), np.concatenate([[0.0], y])
     inside = x < end
-    x_inside, y_inside = x[inside], y[inside]
-    heights = np.append(y_inside, np.interp(end, x, y))
-    return float(np.trapezoid(heights, np.append(x_inside, end)) / end)
+    heights = np.append(y[inside], np.interp(end, x, y))
+    return float(np.trapezoid(heights, np.append(x[inside], end)) / end)
 
 
 def median_arrival(times: Sequence[float]) -> float:

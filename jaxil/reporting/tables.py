@@ -21,6 +21,7 @@ from jaxil.reporting.measures import (
 from jaxil.reporting.statistics import Estimate
 
 _NAN = float("nan")
+_REAL = (float, np.floating, np.ndarray)  # the last of no axes
 _PERCENTS = [f"{level * 100:.0f}" for level in LEVELS]
 # Columns of numbers by their format on the page, and titles that differ from the name.
 _COUNTS = ["runs", "tasks", "finished", "unfinished", "empty", "seed", "frames"]
@@ -42,13 +43,7 @@ _TITLES = {
     "share_of_expert": "of the expert",
     "frames_per_second": "frames/s",
     "iqm": "IQM",
-    "mean_low": "90 % from",
-    "mean_high": "to",
-    "iqm_low": "90 % from",
-    "iqm_high": "to",
     _EARLY: f"IQM to {EARLY_FRAMES:,} frames",
-    f"{_EARLY}_low": "90 % from",
-    f"{_EARLY}_high": "to",
     **{f"reached_{percent}": f"reached {percent} %" for percent in _PERCENTS},
     **{f"frames_{percent}": f"{percent} % after frames" for percent in _PERCENTS},
     **{f"hours_{percent}": f"{percent} % after hours" for percent in _PERCENTS},
@@ -56,25 +51,17 @@ _TITLES = {
 
 
 class Table(NamedTuple):
-    """Rows of cells by their column's name in the CSV file; None and NaN are missing.
+    """Rows of cells, of which None and NaN are missing."""
 
-    Attributes:
-      name: of its file.
-      title: on the page.
-      rows: all with the same columns, at least one.
-      about: how to read it.
-      in_shares: whether its means are shares of an expert's return.
-    """
-
-    name: str
-    title: str
-    rows: Sequence[dict[str, Any]]
-    about: str = ""
-    in_shares: bool = False
+    name: str  # of its file
+    title: str  # on the page
+    rows: Sequence[dict[str, Any]]  # by the columns' names in the file, all the same
+    about: str = ""  # how to read it
+    in_shares: bool = False  # whether its means are shares of an expert's return
 
     @property
     def columns(self) -> list[str]:
-        """The columns' names."""
+        """The names of the columns, if there are rows."""
         return list(self.rows[0])
 
 
@@ -89,6 +76,10 @@ def to_csv(table: Table) -> bytes:
 
 def title(column: str) -> str:
     """Returns a column's name on the page."""
+    if column.endswith("_low"):
+        return "90 % from"
+    if column.endswith("_high"):
+        return "to"
     return _TITLES.get(column, column.replace("_", " "))
 
 
@@ -111,7 +102,7 @@ def exact(cell: Any) -> Any:
     """Returns a cell with every digit; "" if it is missing."""
     if _is_missing(cell):
         return ""
-    if isinstance(cell, float | np.floating | np.ndarray):
+    if isinstance(cell, _REAL):
         number = float(cell)
         whole = number.is_integer() and abs(number) < 1e15
         return int(number) if whole else repr(number)
@@ -119,17 +110,16 @@ def exact(cell: Any) -> Any:
 
 
 def _is_missing(cell: Any) -> bool:
-    number = isinstance(cell, float | np.floating | np.ndarray)
-    return cell is None or (number and bool(np.isnan(cell)))
+    return cell is None or (isinstance(cell, _REAL) and bool(np.isnan(cell)))
 
 
-def curve_table(name: str, curves: Sequence[Curve], over: str) -> Table:
-    """Returns the points of the curves; `over` is "frame" or "hours"."""
+def curve_table(name: str, curves: Sequence[Curve]) -> Table:
+    """Returns the points of the curves."""
     rows = []
     for line in curves:
         points = zip(line.x, line.count, *line.mean, strict=True)
         for x, count, mean, low, high in points:
-            row = {"task": line.group.task, "variant": line.group.label, over: x}
+            row = {"task": line.group.task, "variant": line.group.label, line.over: x}
             row |= {"seeds": int(count), "mean": mean, "low": low, "high": high}
             rows.append(row)
     return Table(name, name, rows)

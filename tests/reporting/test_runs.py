@@ -268,9 +268,7 @@ def test_a_return_is_a_share_of_its_own_experts(tmp_path):
         folder = tmp_path / str(seed)
         write_run(folder, "pdac", "walker_walk", seed, {1000: 500}, expert=expert)
     (group,) = groups.make_groups(map(runs.read, runs.find([tmp_path])))
-    final = measures.final(group)
-    assert final is not None
-    (row,) = tables.final_table([final]).rows
+    (row,) = tables.final_table(measures.finals([group])).rows
     assert row["share_of_expert"] == 0.75  # 500 of 1000, and 500 of 500
 
 

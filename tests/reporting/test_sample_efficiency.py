@@ -24,10 +24,10 @@ def test_how_soon_methods_learn_is_joined_over_the_tasks_that_they_share(tmp_pat
     ends = [row[f"share_to_100k{end}"] for end in ("", "_low", "_high")]
     np.testing.assert_allclose(ends, [1 / 3, 0.3, 1.1 / 3])
 
-    sheet = charts.early_sheet(tasks, joined, name="sample_efficiency")
+    sheet = charts.early_sheet(tasks, joined)
     assert sheet is not None
     titles = [panel.title for panel in sheet.panels]
     assert titles == ["2 tasks together", "cartpole_swingup", "walker_walk"]
     one = {"walker_walk": tasks["walker_walk"]}
     assert not measures.early_over_tasks(one)  # nothing to join
-    assert charts.early_sheet({}, [], name="sample_efficiency") is None
+    assert charts.early_sheet({}, []) is None
