@@ -125,7 +125,7 @@ def rendering(config: Any) -> Iterator[Finding]:
 
     backend, size = os.environ.get("MUJOCO_GL", ""), config.image_size
     try:
-        if backend in ("disable", "disabled", "off", "false", "0"):
+        if backend in startup.NO_GL:
             raise RuntimeError("nothing renders")
         times = {each: _render(config.task, size, each) for each in RENDER_QUALITIES}
     except (ImportError, RuntimeError) as error:
@@ -136,8 +136,7 @@ def rendering(config: Any) -> Iterator[Finding]:
     yield Finding("ok", "MUJOCO_GL", backend)
     name, _ = times["paper"]
     advice = ""
-    in_software = renders_in_software(name)
-    if in_software and devices.has_cuda_device():
+    if renders_in_software(name) and devices.has_cuda_device():
         name += ": renders on the CPU, although there is a CUDA device"
         advice = "install the NVIDIA driver's EGL (libnvidia-gl); start a container "
         advice += "with NVIDIA_DRIVER_CAPABILITIES=all"
@@ -161,8 +160,7 @@ def memory(config: Any) -> Iterator[Finding]:
     if config.observation != "pixels":  # state vectors are small
         yield Finding("ok", "memory", value)
         return
-    needed = memory_bytes(config)
-    copied = device_memory_bytes(config)
+    needed, copied = replay_bytes(config)
     replay = f"the replay of {config.replay_size_steps} steps"
     if copied and devices.device_name().startswith("cpu"):
         replay, needed = f"{replay} and its device copy", needed + copied
@@ -254,33 +252,23 @@ def main(argv: list[str]) -> int:
     return 1 if num_faults else 0
 
 
-def memory_bytes(config: Any) -> int:
-    """Returns the bytes of this config's replay when full, for pixels."""
-    from jaxil.replay import replay
+def replay_bytes(config: Any) -> tuple[int, int]:
+    """Returns the bytes of a full replay of pixels and of its copy on the device.
 
-    return replay.memory_bytes(**_ring_sizes(config), action_dim=8)
-
-
-def device_memory_bytes(config: Any) -> int:
-    """Returns the bytes of the device's copy of the replay's frames, for pixels.
-
-    It is reserved at the start; 0 unless `replay_on_device`.
+    The copy, of the frames alone, is reserved at the start; 0 without one.
     """
-    from jaxil.replay import replay
-
-    return replay.frames_bytes(**_ring_sizes(config)) if config.replay_on_device else 0
-
-
-def _ring_sizes(config: Any) -> dict[str, Any]:
     from jaxil.environments import tasks
+    from jaxil.replay import replay
 
     length = config.action_repeat, config.max_episode_frames
-    return {
+    sizes: dict[str, Any] = {
         "capacity_steps": config.replay_size_steps,
         "episode_steps": tasks.timing(config.task, *length)[1],
         "observation_shape": (config.image_size, config.image_size, 3),
         "observation_dtype": "uint8",
     }
+    copied = replay.frames_bytes(**sizes) if config.replay_on_device else 0
+    return replay.memory_bytes(**sizes, action_dim=8), copied
 
 
 if __name__ == "__main__":

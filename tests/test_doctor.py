@@ -188,7 +188,7 @@ def test_jax_on_the_cpu_beside_a_device_is_warned_of(monkeypatch):
 
 
 def test_memory_is_compared_with_the_replay(monkeypatch, config):
-    needed = doctor.memory_bytes(config)
+    needed = doctor.replay_bytes(config)[0]
     levels = {}
     for available in (0.5 * needed, needed + 1e9, needed + 4e9):
         monkeypatch.setattr(
@@ -202,7 +202,7 @@ def test_memory_is_compared_with_the_replay(monkeypatch, config):
 
 def test_short_episodes_need_a_frame_more_each(config):
     config.replay_on_device, config.max_episode_frames = True, 2 * config.action_repeat
-    frames = doctor.device_memory_bytes(config)
+    frames = doctor.replay_bytes(config)[1]
     assert frames == 1.5 * config.replay_size_steps * 48 * 48 * 3
 
 
@@ -213,9 +213,9 @@ def test_states_take_little_memory(monkeypatch, config):
 
 
 def test_a_copy_on_the_device_is_counted_where_it_lies(monkeypatch, config):
-    plain = doctor.memory_bytes(config)
+    plain = doctor.replay_bytes(config)[0]
     config.replay_on_device = True
-    frames = doctor.device_memory_bytes(config)
+    frames = doctor.replay_bytes(config)[1]
     # 150000 steps in 300 episodes of 500: one frame more in each.
     assert frames == 150_300 * 48 * 48 * 3
     monkeypatch.setattr(memory, "available_bytes", lambda: int(plain + 2e9))

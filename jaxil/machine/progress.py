@@ -165,14 +165,14 @@ def _sparkline(values: Sequence[float]) -> str:
 
 
 @contextlib.contextmanager
-def shown(label: str, unit: str = "images") -> Iterator[Callable[[int, int], None]]:
-    """Yields a function (done, total) that shows a progress line in this block."""
+def shown(label: str) -> Iterator[Callable[[int, int], None]]:
+    """Yields a function (done, total) that shows a line on images in this block."""
     with contextlib.ExitStack() as stack:
         lines: list[ProgressLine] = []
 
         def show(done: int, total: int) -> None:
             if not lines:
-                line = ProgressLine(total, first_frame=done, label=label, unit=unit)
+                line = ProgressLine(total, first_frame=done, label=label, unit="images")
                 lines.append(stack.enter_context(contextlib.closing(line)))
             lines[0].update(done, {})
 

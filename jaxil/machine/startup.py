@@ -34,10 +34,9 @@ os._exit(0)
 """
 _GL_PROBE_SECONDS, _GL_PROBE_TRIES = 15.0, 2
 # As dm_control spells them.
-_GL_BACKENDS = (
-    *("", "glfw", "on", "enable", "enabled", "true", "1", "egl", "osmesa"),
-    *("disable", "disabled", "off", "false", "0"),
-)
+NO_GL = ("disable", "disabled", "off", "false", "0")
+_GLFW = ("", "glfw", "on", "enable", "enabled", "true", "1")
+_GL_BACKENDS = (*_GLFW, "egl", "osmesa", *NO_GL)
 # Options of glibc's malloc.h that keep freed memory in the process: all blocks come
 # from one heap, which is never trimmed.
 _MALLOC_SETTINGS = (
