@@ -44,7 +44,7 @@ def write_report(
     sheets = {
         "by_frames": by_frames,
         "by_hours": by_hours,
-        "bars": charts.bar_sheet(finals, "final_returns"),
+        "bars": charts.bar_sheet(groups, "final_returns"),
         "early": charts.early_sheet(soon, joined),
         "distance": distance,
         "logits": charts.logit_sheet(groups),

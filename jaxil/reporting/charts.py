@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxil.reporting import figures, measures, plots
 from jaxil.reporting.groups import Group, expert_returns, tasks_of
-from jaxil.reporting.measures import Curve, Early, Final
+from jaxil.reporting.measures import Curve, Early
 from jaxil.reporting.sheets import Panel, Sheet
 from jaxil.reporting.statistics import Estimate
 
@@ -55,14 +55,14 @@ def curve_sheet(
     return _sheet(name, panels, [line.group for line in found], caption), found
 
 
-def bar_sheet(finals: Sequence[Final], name: str) -> Sheet | None:
+def bar_sheet(groups: Sequence[Group], name: str) -> Sheet | None:
     """Plots the last evaluations; None without any."""
-    tasks: dict[str, list[Final]] = {}
-    for final in finals:
-        tasks.setdefault(final.group.task, []).append(final)
     panels = []
-    for task, task_finals in tasks.items():
-        experts = {round(f.expert, 1) for f in task_finals if np.isfinite(f.expert)}
+    for task, task_groups in tasks_of(groups).items():
+        finals = measures.finals(task_groups)
+        if not finals:
+            continue
+        experts = {round(f.expert, 1) for f in finals if np.isfinite(f.expert)}
         name_of_axis = "task return" + (", expert dashed" if experts else "")
         rows = [
             plots.Bar(
@@ -71,7 +71,7 @@ def bar_sheet(finals: Sequence[Final], name: str) -> Sheet | None:
                 final.mean,
                 final.group.num_finished < len(final.group.runs),
             )
-            for final in task_finals
+            for final in finals
         ]
         panels.append(_bar_panel(task, rows, levels=sorted(experts), name=name_of_axis))
     caption = (

@@ -124,34 +124,17 @@ def _sheet(path: pathlib.Path, name: str, colour: str) -> Sheet | None:
     """
     names = _NUM_AXES.keys() & archive.member_names(path)
     limits = dict.fromkeys(names, _MAX_ARRAY_BYTES)
-    stored = _arrays(archive.read_archive(path, max_bytes=limits))
+    filmed = plots.Filmed(**_arrays(archive.read_archive(path, max_bytes=limits)))
     panels = []
     margins = plots.REWARD_MARGINS  # of all, so that their times line up
-    step_seconds = float(stored.get("step_seconds", 0.0))
-    imitation, task, plan = (
-        stored.get(name, np.zeros(0))
-        for name in ("imitation_rewards", "task_rewards", "plan")
-    )
-    if np.isfinite(imitation).any():
-        draw = functools.partial(
-            plots.rewards,
-            imitation=imitation,
-            task=task if np.isfinite(task).any() else np.zeros(0),
-            colour=colour,
-            step_seconds=step_seconds,
-        )
+    if np.isfinite(filmed.imitation_rewards).any():
+        draw = functools.partial(plots.rewards, filmed=filmed, colour=colour)
         panels.append(Panel("rewards", draw, _REWARD_HEIGHT, margins))
-    if plan.any():
-        draw = functools.partial(plots.plan, weights=plan, step_seconds=step_seconds)
+    if filmed.plan.any():
+        draw = functools.partial(plots.plan, filmed=filmed)
         panels.append(Panel("transport plan", draw, _PLAN_HEIGHT, margins))
-        if {"agent_strip", "expert_strip"} <= stored.keys():
-            draw = functools.partial(
-                plots.alignment,
-                weights=plan,
-                agent_strip=stored["agent_strip"],
-                expert_strip=stored["expert_strip"],
-                step_seconds=step_seconds,
-            )
+        if filmed.agent_strip.size and filmed.expert_strip.size:
+            draw = functools.partial(plots.alignment, filmed=filmed)
             panels.append(Panel("alignment", draw, _ALIGNMENT_HEIGHT, margins))
     return Sheet(name, tuple(panels)) if panels else None
 

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from jaxil.reporting import charts, figures, measures
+from jaxil.reporting import charts, figures
 from jaxil.reporting.figures import Figure
 from jaxil.reporting.groups import Group
 from jaxil.reporting.sheets import Sheet
@@ -72,5 +72,5 @@ def _num_finished(
 def _sheet(figure: Figure, groups: list[Group]) -> Sheet | None:
     name = f"figure{figure.number:02d}"
     if figure.kind == "bars":
-        return charts.bar_sheet(measures.finals(groups), name)
+        return charts.bar_sheet(groups, name)
     return charts.curve_sheet(groups, figure.kind, name)[0]

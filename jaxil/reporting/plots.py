@@ -1,10 +1,11 @@
 """Plots one panel: curves, bars, logits, an episode's rewards, a transport plan."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import PowerNorm
 from matplotlib.ticker import EngFormatter, MaxNLocator
@@ -29,7 +30,7 @@ _MAX_MATCHES, _STRIP, _LINE_WIDTHS = 60, 0.27, (0.25, 2.5)
 
 
 def curves(
-    axes: Any,
+    axes: Axes,
     lines: Sequence[Curve],
     *,
     levels: Sequence[tuple[float, str]] = (),
@@ -38,7 +39,7 @@ def curves(
     """Plots the mean of each group with its interval.
 
     Args:
-      axes: Matplotlib's.
+      axes: of the panel.
       lines: at least one, all over the same.
       levels: heights to mark with a dashed line, and their names; highest first.
       name: of the vertical axis.
@@ -81,12 +82,12 @@ class Bar(NamedTuple):
 
 
 def bars(
-    axes: Any, rows: Sequence[Bar], *, levels: Sequence[float] = (), name: str
+    axes: Axes, rows: Sequence[Bar], *, levels: Sequence[float] = (), name: str
 ) -> None:
     """Plots a bar for each group.
 
     Args:
-      axes: Matplotlib's.
+      axes: of the panel.
       rows: from top to bottom, at least one.
       levels: values to mark with a dashed line.
       name: of the horizontal axis.
@@ -141,7 +142,7 @@ def bars_height(rows: int) -> float:
     return 0.6 + _LINE_HEIGHT * _BAR_LINES * rows
 
 
-def logits(axes: Any, pairs: Sequence[tuple[Curve, Curve]]) -> None:
+def logits(axes: Axes, pairs: Sequence[tuple[Curve, Curve]]) -> None:
     """Plots the discriminator's logits of expert (solid) and agent (dotted)."""
     for expert, agent in pairs:
         colour = expert.group.look.colour
@@ -153,29 +154,41 @@ def logits(axes: Any, pairs: Sequence[tuple[Curve, Curve]]) -> None:
     axes.grid(axis="y", alpha=0.16, lw=0.6, color=INK)
 
 
-def rewards(
-    axes: Any,
-    imitation: np.ndarray,
-    task: np.ndarray,
-    colour: str,
-    step_seconds: float,
-) -> None:
-    """Plots the rewards of one episode.
+class Filmed(NamedTuple):
+    """What a filmed episode of T agent steps has beside its pictures, if anything."""
 
-    Args:
-      axes: Matplotlib's.
-      imitation: what the agent learns from. Shape [T].
-      task: the true reward, which it never sees. Shape [T] or empty.
-      colour: of the imitation reward.
-      step_seconds: of an agent step; 0 if unknown.
-    """
-    step, unit = _time(step_seconds)
+    imitation_rewards: np.ndarray = np.zeros(0)  # what the agent learns from. Shape [T]
+    task_rewards: np.ndarray = np.zeros(0)  # which it never sees. Shape [T]
+    plan: np.ndarray = np.zeros((0, 0))  # of transport, >= 0. Shape [T + 1, N + 1]
+    # Evenly spaced frames from first to last, uint8 [n, H, W, 3].
+    agent_strip: np.ndarray = np.zeros((0, 0, 0, 3))
+    expert_strip: np.ndarray = np.zeros((0, 0, 0, 3))
+    step_seconds: float | np.ndarray = 0.0  # of an agent step; 0 if unknown
+
+    @property
+    def shares(self) -> np.ndarray:
+        """The share of each agent frame's mass that goes where: rows sum to 1."""
+        return self.plan / np.maximum(self.plan.sum(axis=1, keepdims=True), 1e-12)
+
+    @property
+    def step(self) -> float:
+        """The length of an agent step on a time axis."""
+        return float(self.step_seconds) or 1.0
+
+    def time_axis(self, whose: str) -> str:
+        """Returns the name of a time axis."""
+        return f"{whose}{', seconds' if self.step_seconds else ' step'}"
+
+
+def rewards(axes: Axes, filmed: Filmed, colour: str) -> None:
+    """Plots the rewards of one episode; those of imitation in a colour."""
+    imitation, task, step = filmed.imitation_rewards, filmed.task_rewards, filmed.step
     times = step * np.arange(max(len(imitation), len(task)))
     axes.plot(times[: len(imitation)], imitation, color=colour, lw=1.1)
     axes.set_ylabel("imitation reward", color=colour)
     axes.set_xlim(0, step * max(len(imitation), 2))
-    axes.set_xlabel(f"agent{unit}")
-    if len(task):
+    axes.set_xlabel(filmed.time_axis("agent"))
+    if np.isfinite(task).any():
         other = axes.twinx()
         other.plot(times[: len(task)], task, color=INK, lw=0.9, alpha=0.6)
         other.set_ylabel("task reward")
@@ -183,16 +196,9 @@ def rewards(
         other.spines[["top", "left"]].set_visible(False)
 
 
-def plan(axes: Any, weights: np.ndarray, step_seconds: float) -> None:
-    """Plots a transport plan: which expert frames each agent frame is matched with.
-
-    Args:
-      axes: Matplotlib's.
-      weights: at least 0. Shape [T + 1, N + 1].
-      step_seconds: of an agent step; 0 if unknown.
-    """
-    shares = _shares(weights)
-    step, unit = _time(step_seconds)
+def plan(axes: Axes, filmed: Filmed) -> None:
+    """Plots a transport plan: which expert frames each agent frame is matched with."""
+    shares, step = filmed.shares, filmed.step
     image = axes.imshow(
         shares.T,
         origin="lower",
@@ -202,38 +208,22 @@ def plan(axes: Any, weights: np.ndarray, step_seconds: float) -> None:
         interpolation="nearest",
         extent=(0, step * shares.shape[0], 0, step * shares.shape[1]),
     )
-    axes.set_xlabel(f"agent{unit}")
-    axes.set_ylabel(f"expert{unit}")
+    axes.set_xlabel(filmed.time_axis("agent"))
+    axes.set_ylabel(filmed.time_axis("expert"))
     scale = axes.inset_axes((1.025, 0, 0.03, 1))
     axes.figure.colorbar(image, cax=scale).set_label("share", labelpad=2)
 
 
-def alignment(
-    axes: Any,
-    weights: np.ndarray,
-    agent_strip: np.ndarray,
-    expert_strip: np.ndarray,
-    step_seconds: float,
-) -> None:
-    """Plots a transport plan as lines between two film strips.
+def alignment(axes: Axes, filmed: Filmed) -> None:
+    """Plots a transport plan as lines between the two film strips.
 
     Each of evenly spaced agent frames has a line to the expert frame that receives
     most of its mass; the width shows that share, the colour the agent's time.
-
-    Args:
-      axes: Matplotlib's.
-      weights: at least 0. Shape [T + 1, N + 1].
-      agent_strip: evenly spaced frames from first to last, uint8 [n, H, W, 3].
-      expert_strip: the same for the expert.
-      step_seconds: of an agent step; 0 if unknown.
     """
-    shares = _shares(weights)
-    step, unit = _time(step_seconds)
+    shares, step = filmed.shares, filmed.step
     ends = [step * size for size in shares.shape]
-    for strip, end, low in (
-        (agent_strip, ends[0], 1.0 - _STRIP),
-        (expert_strip, ends[1], 0.0),
-    ):
+    strips = (filmed.agent_strip, filmed.expert_strip)
+    for strip, end, low in zip(strips, ends, (1.0 - _STRIP, 0.0)):
         extent = (0, end, low, low + _STRIP)
         axes.imshow(np.concatenate([*strip], axis=1), extent=extent, aspect="auto")
     lines, widths, colours = [], [], []
@@ -249,20 +239,10 @@ def alignment(
     axes.set_yticks([_STRIP / 2, 1 - _STRIP / 2], ["expert", "agent"])
     axes.tick_params(axis="y", length=0)
     axes.spines["left"].set_visible(False)
-    axes.set_xlabel(unit.strip(" ,"))
+    axes.set_xlabel(filmed.time_axis("").strip(" ,"))
 
 
-def _shares(weights: np.ndarray) -> np.ndarray:
-    """Returns the share of each agent frame's mass that goes where: rows sum to 1."""
-    return weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
-
-
-def _time(step_seconds: float) -> tuple[float, str]:
-    """Returns the length of a step on a time axis, and the end of the axis's name."""
-    return (step_seconds, ", seconds") if step_seconds else (1.0, " step")
-
-
-def _line(axes: Any, line: Curve) -> None:
+def _line(axes: Axes, line: Curve) -> None:
     look = line.group.look
     marker = look.marker if len(line.x) <= _MAX_MARKED else None
     mean, low, high = line.mean
@@ -292,7 +272,7 @@ def _vertical(heights: np.ndarray, bands: np.ndarray) -> tuple[float, float]:
     return bottom, top + 0.08 * size
 
 
-def _horizontal(axes: Any, lines: Sequence[Curve]) -> None:
+def _horizontal(axes: Axes, lines: Sequence[Curve]) -> None:
     right = max(float(line.x[-1]) for line in lines)
     axes.set_xlim(0, 1.02 * right if right > 0 else 1.0)
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))

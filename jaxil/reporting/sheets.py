@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import matplotlib
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -49,7 +50,7 @@ class Panel(NamedTuple):
     """One plot."""
 
     title: str  # such as the task
-    draw: Callable[[Any], None]  # onto Matplotlib's axes
+    draw: Callable[[Axes], None]
     height: float | None = None  # in inches; None for that of curves
     margins: tuple[float, float] = _MARGINS  # left and right of the axes, in inches
 
@@ -105,7 +106,7 @@ def _figure(
     *,
     title: float,
     beside: int,
-) -> tuple[Any, list[Any]]:
+) -> tuple[Figure, list[Axes]]:
     """Returns a figure with its legend, and the axes of each panel.
 
     `title` is the height of a panel's title; `beside` how many panels share a row.
@@ -149,7 +150,7 @@ def _figure(
     return figure, axes
 
 
-def _saved(figure: Any, kind: str, *, transparent: bool = False) -> bytes:
+def _saved(figure: Figure, kind: str, *, transparent: bool = False) -> bytes:
     stream = io.BytesIO()
     # Without date and version, the same runs give the same bytes.
     metadata = {"svg": {"Date": None, "Creator": None}, "png": {"Software": None}}

@@ -18,7 +18,6 @@ from jaxil.reporting.measures import (
     arrivals,
     early,
 )
-from jaxil.reporting.statistics import Estimate
 
 _NAN = float("nan")
 _REAL = (float, np.floating, np.ndarray)  # the last of no axes
@@ -190,8 +189,7 @@ def efficiency_table(groups: Sequence[Group]) -> Table:
                 median = statistics.median_arrival([each[k] for each in times])
                 row[f"{unit}_{percent}"] = median
         soon = early(group)
-        unknown = Estimate(*[np.asarray(_NAN)] * 3)
-        row |= _interval(_EARLY, unknown if soon is None else soon.iqm)
+        row |= _interval(_EARLY, soon.iqm if soon else [_NAN] * 3)
         speeds = [run.frames_per_second for run in runs]
         rows.append({**row, "frames_per_second": np.median(speeds)})
     about = (
@@ -291,7 +289,7 @@ def shared_changes(groups: Sequence[Group]) -> dict[str, Any]:
     return {k: v for k, v in first.items() if all(o.get(k) == v for o in others)}
 
 
-def _interval(key: str, estimate: Estimate) -> dict[str, Any]:
+def _interval(key: str, estimate: Sequence[Any]) -> dict[str, Any]:
     value, low, high = estimate
     return {key: value, f"{key}_low": low, f"{key}_high": high}
 
