@@ -2,13 +2,14 @@
 
 import json
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from jaxil import config as jaxil_config
 from jaxil.files import video
+from jaxil.reporting import groups, runs
 
 EVAL_HEADER = (
     "frame,seconds,episode,task_return_mean,task_return_std,expert_task_return_mean,"
@@ -69,6 +70,19 @@ def write_run(
     return folder
 
 
+def change_config(folder: pathlib.Path, changes: Mapping[str, Any]) -> None:
+    """Replaces settings in a run's config.json, as another jaxil may have done."""
+    path = folder / "config.json"
+    stored = json.loads(path.read_text())
+    stored["config"] |= changes
+    path.write_text(json.dumps(stored))
+
+
+def groups_below(root: pathlib.Path) -> list[groups.Group]:
+    """Returns the groups of all runs below a folder."""
+    return groups.make_groups(map(runs.read, runs.find([root])))
+
+
 def film(folder: pathlib.Path, frame: int, *, plan: bool) -> None:
     """Adds a real video of 30 pictures with the rewards of its episode."""
     videos = folder / "videos"
@@ -91,65 +105,36 @@ def film(folder: pathlib.Path, frame: int, *, plan: bool) -> None:
 
 def many_runs(root: pathlib.Path) -> pathlib.Path:
     """Writes two tasks, three variants, several seeds, and what can go wrong."""
-    cartpole, walker = root / "cartpole_swingup", root / "walker_walk"
-    seeds: Sequence[tuple[float, float, float]] = (
-        (100, 500, 800),
-        (200, 700, 900),
-        (300, 900, 1000),
-    )
-    for seed, returns in enumerate(seeds):
-        folder = write_run(
-            cartpole / "pdac" / f"seed{seed}",
-            "pdac",
-            "cartpole_swingup",
-            seed,
-            dict(zip((1000, 2000, 3000), returns, strict=True)),
-            logits=True,
-        )
-    film(cartpole / "pdac" / "seed0", 2000, plan=False)
-    for seed, returns in enumerate(({1000: 100, 3000: 300}, {2000: 400, 3000: 600})):
-        folder = write_run(
-            cartpole / "psil" / f"seed{seed}", "psil", "cartpole_swingup", seed, returns
-        )
+
+    def write(name: str, method: str, seed: int, returns: Any, **options: Any):
+        task = name.split("/")[0]
+        return write_run(root / name, method, task, seed, returns, **options)
+
+    cartpole, walker = "cartpole_swingup", "walker_walk"
+    for seed, last in enumerate(((500, 800), (700, 900), (900, 1000))):
+        returns = {1000: 100 * (seed + 1), 2000: last[0], 3000: last[1]}
+        write(f"{cartpole}/pdac/seed{seed}", "pdac", seed, returns, logits=True)
+    film(root / cartpole / "pdac" / "seed0", 2000, plan=False)
+    write(f"{cartpole}/psil/seed0", "psil", 0, {1000: 100, 3000: 300})
+    folder = write(f"{cartpole}/psil/seed1", "psil", 1, {2000: 400, 3000: 600})
     film(folder, 3000, plan=True)
-    write_run(
-        cartpole / "pdac_no_augmentation" / "seed0",
-        "pdac",
-        "cartpole_swingup",
-        0,
-        {1000: 50, 2000: 150},  # of 3000: unfinished
-        changes={"shift_padding": 0},
-    )
+    unfinished, changes = {1000: 50, 2000: 150}, {"shift_padding": 0}  # of 3000
+    name = f"{cartpole}/pdac_no_augmentation/seed0"
+    write(name, "pdac", 0, unfinished, changes=changes)
     for name, last in (("first", 400), ("again", 600)):  # the same seed twice
-        write_run(
-            walker / name,
-            "pdac",
-            "walker_walk",
-            0,
-            {1000: 100, 3000: last},
-            expert=500.0,
-        )
-    write_run(
-        walker / "repeat4",
-        "pdac",
-        "walker_walk",
-        0,
-        {3000: 450},
-        expert=900.0,
-        changes={"action_repeat": 4, "batch_size": 64},
-    )
-    write_run(walker / "drqv2", "drqv2", "walker_walk", 0, {3000: 800}, expert="")
-    write_run(walker / "not_begun", "psil", "walker_walk", 0, None)
-    header_only = write_run(walker / "header_only", "psil", "walker_walk", 1, {})
+        write(f"{walker}/{name}", "pdac", 0, {1000: 100, 3000: last}, expert=500.0)
+    changes = {"action_repeat": 4, "batch_size": 64}
+    write(f"{walker}/repeat4", "pdac", 0, {3000: 450}, expert=900.0, changes=changes)
+    write(f"{walker}/drqv2", "drqv2", 0, {3000: 800}, expert="")
+    write(f"{walker}/not_begun", "psil", 0, None)
+    header_only = write(f"{walker}/header_only", "psil", 1, {})
     (header_only / "train.csv").write_text("")
-    cut_off = write_run(
-        walker / "cut_off", "psil", "walker_walk", 2, {1000: float("nan"), 2000: 300}
-    )
+    cut_off = write(f"{walker}/cut_off", "psil", 2, {1000: float("nan"), 2000: 300})
     with (cut_off / "eval.csv").open("a") as file:
         file.write("3000,10800,3,9")  # killed in mid-line
     (cut_off / "videos").mkdir()
     (cut_off / "videos" / "frame_000002000.mp4").write_bytes(b"not a video")
-    damaged = walker / "damaged"
+    damaged = root / walker / "damaged"
     damaged.mkdir()
     (damaged / "config.json").write_text('{"config": {"method": "pdac"')
     return root

@@ -4,9 +4,9 @@ import pytest
 
 from jaxil import config as jaxil_config
 from jaxil import methods, outside
-from jaxil.reporting import groups, paper, runs
+from jaxil.reporting import paper
 from jaxil.reporting.figures import FIGURES, Variant, variant_of
-from tests.reporting.run_folders import write_run
+from tests.reporting.run_folders import groups_below, write_run
 
 EVERY = sorted(
     {variant.slug: variant for f in FIGURES.values() for variant in f.variants}.items()
@@ -85,8 +85,7 @@ def test_an_ablation_is_plotted_once_a_changed_run_has_an_evaluation(tmp_path):
     )
 
     def plotted():
-        made = groups.make_groups(map(runs.read, runs.find([tmp_path])))
-        shown = paper.paper_figures(made, None)
+        shown = paper.paper_figures(groups_below(tmp_path), None)
         return [each.figure.number for each in shown if each.sheet is not None]
 
     assert plotted() == [2, 3, 4]

@@ -1,9 +1,13 @@
 """Runs from elsewhere: behind links, and of methods that are not installed."""
 
-import json
-
 from jaxil.reporting import groups, runs
-from tests.reporting.run_folders import write_run
+from tests.reporting.run_folders import change_config, write_run
+
+
+def read_foreign(folder, seed, method, own):
+    write_run(folder, "pdac", "walker_walk", seed, {1000: 1})
+    change_config(folder, {"method": method, "own": own})
+    return runs.read(folder)
 
 
 def test_linked_runs_are_found_and_circles_of_links_end(tmp_path):
@@ -19,33 +23,23 @@ def test_code_that_only_folders_name_is_not_run(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     shown = []
     for seed, own in enumerate(({"size": 1, "rate": 2}, {"size": 2})):
-        folder = write_run(tmp_path / str(seed), "pdac", "walker_walk", seed, {1000: 1})
-        stored = json.loads((folder / "config.json").read_text())
-        stored["config"] |= {"method": "evil_method:METHOD", "own": own}
-        (folder / "config.json").write_text(json.dumps(stored))
-        shown.append(runs.read(folder))
+        folder = tmp_path / str(seed)
+        shown.append(read_foreign(folder, seed, "evil_method:METHOD", own))
     labels = [group.label for group in groups.make_groups(shown)]
     assert labels == [f"evil_method:METHOD (own.size {size})" for size in (1, 2)]
 
 
 def test_names_of_unknown_fields_that_no_page_can_hold_are_left_out(tmp_path):
-    folder = write_run(tmp_path / "run", "pdac", "walker_walk", 0, {1000: 1})
-    stored = json.loads((folder / "config.json").read_text())
     own = {"fine": 1, "\x1b[31m": 2, "long" * 1000: 3}
-    stored["config"] |= {"method": "gone.away:METHOD", "own": own}
-    (folder / "config.json").write_text(json.dumps(stored))
-    config = runs.read(folder).config
+    config = read_foreign(tmp_path / "run", 0, "gone.away:METHOD", own).config
     assert [name for name in config if name.startswith("own.")] == ["own.fine"]
 
 
 def test_a_run_whose_method_is_not_installed_is_shown(tmp_path):
     shown = []
     for seed, size in enumerate((1, 1, 2)):
-        folder = write_run(tmp_path / str(seed), "pdac", "walker_walk", seed, {1000: 1})
-        stored = json.loads((folder / "config.json").read_text())
-        stored["config"] |= {"method": "gone.away:METHOD", "own": {"size": size}}
-        (folder / "config.json").write_text(json.dumps(stored))
-        shown.append(runs.read(folder))
+        folder, own = tmp_path / str(seed), {"size": size}
+        shown.append(read_foreign(folder, seed, "gone.away:METHOD", own))
     said = "'gone.away:METHOD' is code that only its folder names: --trust=gone.away:"
     assert said in " ".join(shown[0].remarks)
     made = groups.make_groups(shown)

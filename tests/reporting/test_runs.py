@@ -8,7 +8,14 @@ import pytest
 
 from jaxil import methods
 from jaxil.reporting import episodes, groups, measures, remarks, runs, tables
-from tests.reporting.run_folders import EVAL_HEADER, film, many_runs, write_run
+from tests.reporting.run_folders import (
+    EVAL_HEADER,
+    change_config,
+    film,
+    groups_below,
+    many_runs,
+    write_run,
+)
 
 
 @pytest.fixture(scope="module")
@@ -23,6 +30,11 @@ def found(tmp_path_factory):
         else:
             read[str(folder.relative_to(root))] = run
     return read
+
+
+@pytest.fixture(scope="module")
+def made(found):
+    return groups.make_groups(run for run in found.values() if not isinstance(run, str))
 
 
 def test_every_run_is_found_once(found, tmp_path):
@@ -111,9 +123,7 @@ def test_a_damaged_table_is_named_and_the_run_kept(tmp_path, text, expected):
 )
 def test_a_damaged_config_is_refused(tmp_path, change, expected):
     folder = write_run(tmp_path / "run", "pdac", "walker_walk", 0, None)
-    stored = json.loads((folder / "config.json").read_text())
-    stored["config"].update(change)
-    (folder / "config.json").write_text(json.dumps(stored))
+    change_config(folder, change)
     with pytest.raises(runs.UnreadableError, match=expected):
         runs.read(folder)
 
@@ -161,8 +171,7 @@ def test_a_video_is_shown_without_what_is_damaged_beside_it(tmp_path, seconds):
     else:
         np.savez(path, imitation_rewards=np.ones(3), step_seconds=np.asarray(seconds))
         expected = "it has an array step_seconds that is no duration"
-    made = groups.make_groups([runs.read(folder)])
-    ((episode,), (sentence,)) = episodes.collect(made, 1)
+    ((episode,), (sentence,)) = episodes.collect(groups_below(tmp_path), 1)
     assert episode.sheet is None
     assert sentence.endswith(expected)
 
@@ -174,13 +183,12 @@ def test_fields_of_an_older_config_have_defaults_or_are_ignored(tmp_path):
     stored["config"]["sinkhorn"] = {"epsilon": 3}  # of methods that P-DAC is not
     stored["config"]["encoder"]["chunk_size"] = 7
     (old / "config.json").write_text(json.dumps(stored))
-    new = write_run(tmp_path / "new", "pdac", "walker_walk", 1, {1000: 1})
-    (group,) = groups.make_groups([runs.read(old), runs.read(new)])
+    write_run(tmp_path / "new", "pdac", "walker_walk", 1, {1000: 1})
+    (group,) = groups_below(tmp_path)
     assert [run.seed for run in group.runs] == [0, 1]
 
 
-def test_groups_are_seeds_with_equal_settings_in_the_papers_order(found):
-    made = groups.make_groups(run for run in found.values() if not isinstance(run, str))
+def test_groups_are_seeds_with_equal_settings_in_the_papers_order(made):
     named = [(group.task, group.label, len(group.runs)) for group in made]
     assert named == [
         ("cartpole_swingup", "P-DAC", 3),
@@ -216,26 +224,25 @@ def test_only_settings_that_matter_split_a_group(tmp_path):
     assert len(groups.make_groups(sil)) == 3
 
 
-def test_several_settings_get_a_letter_and_a_row_that_explains_it(found):
-    read = [run for run in found.values() if not isinstance(run, str)]
-    (row,) = tables.settings_table(groups.make_groups(read)).rows
+def test_several_settings_get_a_letter_and_a_row_that_explains_it(made):
+    (row,) = tables.settings_table(made).rows
     assert row == {"variant": "P-DAC (A)", "settings": "action_repeat 4, batch_size 64"}
 
 
 def test_a_label_means_the_same_on_every_task(tmp_path):
-    read = []
-    for task, changes in (
-        ("walker_walk", {}),
-        ("walker_walk", {"batch_size": 64}),
-        ("hopper_hop", {"action_repeat": 4}),
-        ("hopper_hop", {"action_repeat": 4, "batch_size": 64}),
-        ("hopper_hop", {"action_repeat": 4, "shift_padding": 0}),
-        ("walker_walk", {"shift_padding": 0}),
+    for number, (task, changes) in enumerate(
+        (
+            ("walker_walk", {}),
+            ("walker_walk", {"batch_size": 64}),
+            ("hopper_hop", {"action_repeat": 4}),
+            ("hopper_hop", {"action_repeat": 4, "batch_size": 64}),
+            ("hopper_hop", {"action_repeat": 4, "shift_padding": 0}),
+            ("walker_walk", {"shift_padding": 0}),
+        )
     ):
-        folder = tmp_path / str(len(read))
+        folder = tmp_path / str(number)
         write_run(folder, "pdac", task, 0, {1000: 1}, changes=changes)
-        read.append(runs.read(folder))
-    assert {(group.task, group.label) for group in groups.make_groups(read)} == {
+    assert {(group.task, group.label) for group in groups_below(tmp_path)} == {
         (task, label)
         for task in ("walker_walk", "hopper_hop")
         for label in ("P-DAC", "P-DAC (batch_size 64)", "P-DAC, no augmentation")
@@ -246,9 +253,7 @@ def test_what_a_preset_sets_for_a_task_splits_no_method(tmp_path):
     for task, size in (("cartpole_swingup", 400_000), ("walker_walk", 700_000)):
         changes = {"replay_size_steps": size}
         write_run(tmp_path / task, "pdac", task, 0, {1000: 1}, changes=changes)
-    shown = [runs.read(path) for path in runs.find([tmp_path])]
-    made = groups.make_groups(shown)
-    assert [group.label for group in made] == ["P-DAC", "P-DAC"]
+    assert [group.label for group in groups_below(tmp_path)] == ["P-DAC", "P-DAC"]
 
 
 def test_methods_with_one_label_are_told_apart(tmp_path, monkeypatch):
@@ -257,8 +262,7 @@ def test_methods_with_one_label_are_told_apart(tmp_path, monkeypatch):
     monkeypatch.setattr(methods, "get", same.__getitem__)
     for name in same:
         write_run(tmp_path / name, name, "walker_walk", 0, {1000: 1})
-    shown = [runs.read(path) for path in runs.find([tmp_path])]
-    made = groups.make_groups(shown)
+    made = groups_below(tmp_path)
     assert [group.label for group in made] == ["Same", "Same [psil]"]
     assert made[0].look != made[1].look
 
@@ -267,14 +271,11 @@ def test_a_return_is_a_share_of_its_own_experts(tmp_path):
     for seed, expert in enumerate((1000.0, 500.0)):
         folder = tmp_path / str(seed)
         write_run(folder, "pdac", "walker_walk", seed, {1000: 500}, expert=expert)
-    (group,) = groups.make_groups(map(runs.read, runs.find([tmp_path])))
-    (row,) = tables.final_table(measures.finals([group])).rows
+    (row,) = tables.final_table(measures.finals(groups_below(tmp_path))).rows
     assert row["share_of_expert"] == 0.75  # 500 of 1000, and 500 of 500
 
 
-def test_unusual_runs_and_limited_comparisons_are_reported(found):
-    read = [run for run in found.values() if not isinstance(run, str)]
-    made = groups.make_groups(read)
+def test_unusual_runs_and_limited_comparisons_are_reported(made):
     text = "\n".join(remarks.remarks(made))
     for words in (
         "no eval.csv: ",
@@ -294,18 +295,14 @@ def test_unusual_runs_and_limited_comparisons_are_reported(found):
 
 
 def test_fields_of_one_method_alone_are_no_difference(tmp_path):
-    read = [
-        runs.read(write_run(tmp_path / method, method, "walker_walk", 0, {1000: 1.0}))
-        for method in ("pdac", "psil")
-    ]
-    assert not any(
-        "differ" in line for line in remarks.remarks(groups.make_groups(read))
-    )
+    for method in ("pdac", "psil"):
+        write_run(tmp_path / method, method, "walker_walk", 0, {1000: 1.0})
+    said = remarks.remarks(groups_below(tmp_path))
+    assert not any("differ" in line for line in said)
 
 
-def test_looks_are_one_colour_for_a_method_and_differ_within_it(found):
-    read = [run for run in found.values() if not isinstance(run, str)]
-    looks = {group.label: group.look for group in groups.make_groups(read)}
+def test_looks_are_one_colour_for_a_method_and_differ_within_it(made):
+    looks = {group.label: group.look for group in made}
     assert looks["P-DAC"].colour == "#0072b2"
     assert looks["P-SIL"].colour == "#d55e00"
     pdac = [look for label, look in looks.items() if label.startswith("P-DAC")]
@@ -314,11 +311,9 @@ def test_looks_are_one_colour_for_a_method_and_differ_within_it(found):
 
 def test_sample_efficiency_up_to_100000_frames(tmp_path):
     curves = [{50_000: 500, 150_000: 1000}, {50_000: 250, 150_000: 500}, {50_000: 900}]
-    read = [
-        runs.read(write_run(tmp_path / str(seed), "psil", "walker_walk", seed, returns))
-        for seed, returns in enumerate(curves)
-    ]
-    (row,) = tables.efficiency_table(groups.make_groups(read)).rows
+    for seed, returns in enumerate(curves):
+        write_run(tmp_path / str(seed), "psil", "walker_walk", seed, returns)
+    (row,) = tables.efficiency_table(groups_below(tmp_path)).rows
     # 0.4375 and half of it; the third run is too short to count.
     assert row["share_to_100k"] == pytest.approx(0.328125)
     assert row["share_to_100k_low"] < row["share_to_100k"] < row["share_to_100k_high"]
@@ -328,8 +323,6 @@ def test_sample_efficiency_up_to_100000_frames(tmp_path):
 def test_there_are_no_shares_of_an_expert_without_positive_return(tmp_path, expert):
     returns = {1000: -150, 150_000: -60}
     write_run(tmp_path / "run", "psil", "walker_walk", 0, returns, expert=expert)
-    (row,) = tables.efficiency_table(
-        groups.make_groups(map(runs.read, runs.find([tmp_path])))
-    ).rows
+    (row,) = tables.efficiency_table(groups_below(tmp_path)).rows
     shares = ("reached_50", "reached_90", "frames_50", "hours_90", "share_to_100k")
     assert np.isnan([row[name] for name in shares]).all()

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from jaxil.reporting import charts, groups, measures, runs, tables
-from tests.reporting.run_folders import write_run
+from jaxil.reporting import charts, measures, tables
+from tests.reporting.run_folders import groups_below, write_run
 
 
 def test_how_soon_methods_learn_is_joined_over_the_tasks_that_they_share(tmp_path):
@@ -13,9 +13,8 @@ def test_how_soon_methods_learn_is_joined_over_the_tasks_that_they_share(tmp_pat
     write_run(tmp_path / "c", "pdac", "walker_walk", 0, {100_000: 200})
     write_run(tmp_path / "d", "psil", "cartpole_swingup", 0, {100_000: 600})
     write_run(tmp_path / "e", "psil", "walker_walk", 0, {90_000: 1000})  # too short
-    made = groups.make_groups(map(runs.read, runs.find([tmp_path])))
 
-    tasks = measures.early_by_task(made)
+    tasks = measures.early_by_task(groups_below(tmp_path))
     joined = measures.early_over_tasks(tasks)
     (row,) = tables.early_table(joined, len(tasks)).rows
     shown = {key: row[key] for key in ("variant", "tasks", "runs")}
