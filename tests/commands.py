@@ -10,8 +10,8 @@ import sys
 from unittest import mock
 
 from jaxil import command
+from tests.processes import ROOT
 
-ROOT = pathlib.Path(__file__).parent.parent
 # Ten frames per agent step make an episode of 100 steps.
 SMALL = (
     "--config.action_repeat=10",
@@ -36,25 +36,19 @@ SMALL = (
 STATES = ("--config.observation=state", "--config.encoder.subtract_mean_image=False")
 
 # Fields of single methods, in small.
+_DISCRIMINATOR = ("discriminator.hidden_dim=16", "discriminator.batch_size=8")
+_SINKHORN = ("sinkhorn.target_update_steps=150", "sinkhorn.num_iterations=10")
+_CLONING = ("cloning.num_pairs=8", "inverse_model.head_dim=16")
 _OWN = {
-    "pdac": ("discriminator.hidden_dim=16", "discriminator.batch_size=8"),
-    "dac": ("discriminator.hidden_dim=16", "discriminator.batch_size=8"),
+    **dict.fromkeys(("pdac", "dac", "laifo", "gaifo"), _DISCRIMINATOR),
     "patchail": ("discriminator.width=2", "discriminator.batch_size=8"),
-    "laifo": ("discriminator.hidden_dim=16", "discriminator.batch_size=8"),
-    "gaifo": ("discriminator.hidden_dim=16", "discriminator.batch_size=8"),
-    "psil": ("sinkhorn.target_update_steps=150", "sinkhorn.num_iterations=10"),
+    "psil": _SINKHORN,
     "sil": ("discriminator.batch_size=8", "sinkhorn.num_iterations=10"),
     "bc": ("cloning.batch_size=8",),
     "bco": ("cloning.batch_size=8", "inverse_model.hidden_dim=16"),
     "bcvlr": ("cloning.batch_size=8", "latent.hidden_dim=16"),
-    "pdac_cloning": (
-        *("discriminator.hidden_dim=16", "discriminator.batch_size=8"),
-        *("cloning.num_pairs=8", "inverse_model.head_dim=16"),
-    ),
-    "psil_cloning": (
-        *("sinkhorn.target_update_steps=150", "sinkhorn.num_iterations=10"),
-        *("cloning.num_pairs=8", "inverse_model.head_dim=16"),
-    ),
+    "pdac_cloning": (*_DISCRIMINATOR, *_CLONING),
+    "psil_cloning": (*_SINKHORN, *_CLONING),
 }
 
 

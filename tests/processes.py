@@ -7,14 +7,14 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 
-_ROOT = pathlib.Path(__file__).parent.parent
+ROOT = pathlib.Path(__file__).parent.parent
 
 
 def run_python(source: str, *arguments: str, **variables: str) -> str:
     """Runs a program in a separate process, without warnings; returns its output."""
     finished = subprocess.run(
         [sys.executable, "-W", "error", "-c", source, *arguments],
-        cwd=_ROOT,
+        cwd=ROOT,
         env={**os.environ, **variables},
         capture_output=True,
         text=True,

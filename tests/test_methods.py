@@ -2,7 +2,6 @@
 
 import ast
 import inspect
-import json
 import os
 import pathlib
 
@@ -14,7 +13,7 @@ from jaxil.errors import UsageError
 from jaxil.presets import tiny
 from tests.commands import ROOT, SMALL, call, small_run
 from tests.processes import run_python
-from tests.reporting.run_folders import write_run
+from tests.reporting.run_folders import change_config, write_run
 
 _DECLARED = {
     path.stem: path
@@ -241,9 +240,7 @@ def trap(package, tmp_path) -> pathlib.Path:
     (package / "trap" / "__init__.py").write_text(_TRAP)
     (package / "trap" / "inner.py").write_text(_BRIGHT)
     folder = write_run(tmp_path / "run", "zero", "walker_walk", 0, {1000: 10})
-    stored = json.loads((folder / "config.json").read_text())
-    stored["config"]["method"] = "trap.inner:METHOD"
-    (folder / "config.json").write_text(json.dumps(stored))
+    change_config(folder, {"method": "trap.inner:METHOD"})
     return folder
 
 

@@ -1,7 +1,6 @@
 """A generator function in a child process: its results, and how it fails."""
 
 import os
-import pathlib
 import subprocess
 import sys
 import time
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxil.machine.child import ChildError, results
+from tests.processes import ROOT
 
 LIMITS: dict = {
     "seconds": 60.0,
@@ -116,10 +116,9 @@ def test_a_script_without_main_guard_is_not_run_again(tmp_path):
         "print('once')\n"
         "print(*results(echo, '', [], **LIMITS))\n"
     )
-    root = pathlib.Path(__file__).parent.parent.parent
     done = subprocess.run(
         [sys.executable, script],
-        env={**os.environ, "PYTHONPATH": str(root)},
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
     )

@@ -1,7 +1,6 @@
 """A run outlives its terminal and the pipe that it writes to."""
 
 import os
-import pathlib
 import signal
 import subprocess
 import sys
@@ -12,8 +11,7 @@ from jaxil.errors import Fault, UsageError
 from jaxil.machine import screen
 from jaxil.machine.progress import ProgressLine
 from jaxil.machine.signals import StopOnSignals
-
-ROOT = pathlib.Path(__file__).parents[2]
+from tests.processes import ROOT
 
 
 def test_a_closed_stream_is_given_up(tmp_path, monkeypatch):
