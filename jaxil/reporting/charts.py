@@ -25,15 +25,9 @@ _MOST_METRICS = 24  # panels in one figure; more would take long and be too smal
 def curve_sheet(
     groups: Sequence[Group], kind: str, name: str
 ) -> tuple[Sheet | None, list[Curve]]:
-    """Plots one line for each group.
+    """Plots one line for each group; also returns the lines. None without any.
 
-    Args:
-      groups: to show.
-      kind: "frames", "hours" or "wasserstein", see `figures.Figure`.
-      name: of the files.
-
-    Returns:
-      The sheet, or None if no group has such a curve; and the curves.
+    `kind` is "frames", "hours" or "wasserstein", see `figures.Figure`.
     """
     over, column, label = _CURVES[kind]
     panels, found = [], []
@@ -87,9 +81,8 @@ def early_sheet(
 ) -> Sheet | None:
     """Plots how soon each group learns; None if no run is long enough.
 
-    Args:
-      tasks: see `measures.early_by_task`.
-      joined: see `measures.early_over_tasks`; the first panel, unless it is empty.
+    `tasks` are of `measures.early_by_task`; `joined`, of `measures.early_over_tasks`,
+    is the first panel, unless it is empty.
     """
     found = dict(tasks)
     if joined:

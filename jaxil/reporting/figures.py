@@ -128,11 +128,9 @@ def declaration(name: str) -> Method:
 
 
 def variant_of(config: Mapping[str, Any]) -> Variant:
-    """Returns the variant that a run's config makes.
+    """Returns the variant that a run's config, nested as in `config.json`, makes.
 
-    Args:
-      config: nested, as `config.json` holds it. Fields that it lacks, because an
-        older jaxil wrote it, have their defaults.
+    Fields that it lacks, because an older jaxil wrote it, have their defaults.
     """
     overrides, stored = {}, flat(config)
     for field, plain, _ in _variations(config["method"]):

@@ -156,10 +156,9 @@ def task_order(task: str) -> tuple[int, str]:
 
 
 def expert_returns(groups: Iterable[Group]) -> list[tuple[float, list[str]]]:
-    """Returns the different experts of one task's runs.
+    """Returns the different experts of one task's runs: the mean return of each.
 
-    Returns:
-      Mean return of each, falling, with the labels of the groups that imitate it.
+    They fall, and come with the labels of the groups that imitate the expert.
     """
     experts: list[tuple[float, list[str]]] = []
     found = [

@@ -58,11 +58,7 @@ def curve(
 ) -> Curve | None:
     """Joins the seeds of a group; None if none has such a column.
 
-    Args:
-      group: the seeds.
-      over: "frame" or "hours".
-      column: such as "task_return_mean".
-      table: "evaluation" or "training".
+    `over` is "frame" or "hours"; `table`, "evaluation" or "training", has the column.
     """
     pieces = [_series(getattr(run, table), over, column) for run in group.runs]
     found = [piece for piece in pieces if len(piece[0])]
@@ -133,9 +129,7 @@ def early_over_tasks(tasks: Mapping[str, Sequence[Early]]) -> list[Early]:
 def arrivals(run: Run, over: str) -> list[float]:
     """Returns when a run first reached each of LEVELS of its expert; NaN for never.
 
-    Args:
-      run: reaches none without an expert of positive return.
-      over: "frame" or "hours".
+    So without an expert of positive return. `over` is "frame" or "hours".
     """
     position, returns = _series(run.evaluation, over, "task_return_mean")
     expert = run.expert_return if run.expert_return > 0 else float("nan")

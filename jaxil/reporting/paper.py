@@ -18,12 +18,10 @@ class PaperFigure(NamedTuple):
 
 
 def paper_figures(groups: list[Group], num_seeds: int | None) -> list[PaperFigure]:
-    """Returns all figures of the paper's experiments.
+    """Returns all figures of the paper's experiments, also of runs with other settings.
 
-    Args:
-      groups: of all runs; those with other settings than the paper's are plotted, too.
-      num_seeds: how many each line should have; None if unknown: then a figure lacks
-        nothing once it can be plotted.
+    `num_seeds` is how many seeds each line should have; if that is not known (None), a
+    figure lacks nothing once it can be plotted.
     """
     return [_figure(groups, each, num_seeds) for each in figures.FIGURES.values()]
 

@@ -39,7 +39,7 @@ def curves(
     """Plots the mean of each group with its interval.
 
     Args:
-      axes: of the panel.
+      axes: to plot on.
       lines: at least one, all over the same.
       levels: heights to mark with a dashed line, and their names; highest first.
       name: of the vertical axis.
@@ -87,16 +87,15 @@ def bars(
     """Plots a bar for each group.
 
     Args:
-      axes: of the panel.
+      axes: to plot on.
       rows: from top to bottom, at least one.
       levels: values to mark with a dashed line.
       name: of the horizontal axis.
     """
     highest = max([1.0, *levels, *(float(bar.values.max()) for bar in rows)])
-    ends = [float(bar.estimate.high) for bar in rows]
-    bounds = [end for end in ends if np.isfinite(end)]
     # The interval of two seeds can be many times as long as their bar.
-    highest = max([highest, *(min(bound, _BAND_ROOM * highest) for bound in bounds)])
+    ends = np.minimum([bar.estimate.high for bar in rows], _BAND_ROOM * highest)
+    highest = float(np.nanmax([highest, *ends]))
     for row, bar in enumerate(rows):
         colour = bar.group.look.colour
         y = _BAR_LINES * (row + 0.68)

@@ -67,10 +67,8 @@ class Sheet(NamedTuple):
 def inline_svg(panel: Panel, prefix: str, columns: int) -> str:
     """Returns a panel as an <svg> element in the page's colour and font.
 
-    Args:
-      panel: what to plot.
-      prefix: of all ids in it, unique on the page.
-      columns: panels beside each other on a wide page.
+    `prefix`, unique on the page, begins all its ids; `columns` is the number of panels
+    beside each other on a wide page.
     """
     with matplotlib.rc_context({**_SETTINGS, "svg.fonttype": "none"}):
         figure, axes = _figure([panel], title=0.0, beside=columns)

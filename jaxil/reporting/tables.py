@@ -220,9 +220,7 @@ def early_table(joined: Sequence[Early], num_tasks: int) -> Table:
 def seed_table(groups: Sequence[Group], num_seeds: int | None) -> Table:
     """Returns which seeds each variant has on each task.
 
-    Args:
-      groups: of all runs.
-      num_seeds: adds which of seeds 0 to num_seeds - 1 are missing; None: does not.
+    And which of 0 to `num_seeds` - 1 are missing, unless that is None.
     """
     rows = []
     for group in groups:
