@@ -8,7 +8,6 @@ Without --config it checks for the paper's settings.
 Exit status: 0 no faults; 1 a fault; 2 usage error.
 """
 
-import contextlib
 import ctypes.util
 import functools
 import importlib.metadata
@@ -204,10 +203,9 @@ def _render(task: str, image_size: int, quality: str) -> tuple[str, float]:
     """Returns the GL renderer's name and the milliseconds of one image."""
     from jaxil.environments import tasks
 
-    environment = tasks.make_environment(
+    with tasks.make_environment(
         task, seed=0, image_size=image_size, render_quality=quality
-    )
-    with contextlib.closing(environment):
+    ) as environment:
         environment.reset()
         if environment.frame().std() == 0:  # also creates the GL context
             raise RuntimeError("images are blank: try MUJOCO_GL=osmesa")

@@ -14,7 +14,7 @@ def available_bytes(root: pathlib.Path = pathlib.Path("/")) -> int | None:
     a batch job) allow. File caches count as free. `root` is for tests.
     """
     meminfo = _read_fields(root / "proc/meminfo")
-    bounds = [1024 * meminfo[name] for name in ("MemAvailable",) if name in meminfo]
+    bounds = [1024 * meminfo["MemAvailable"]] if "MemAvailable" in meminfo else []
     for group in _control_groups(root):
         for limit_file, usage_file, cache_field in (
             ("memory.max", "memory.current", "inactive_file"),

@@ -5,10 +5,7 @@ from typing import Any
 
 from jaxil.machine import devices
 
-_PACKAGES = (
-    *("jaxil", "jax", "jaxlib", "flax", "optax"),
-    *("mujoco", "dm-control", "numpy"),
-)
+_PACKAGES = ["jaxil", "jax", "jaxlib", "flax", "optax", "mujoco", "dm-control", "numpy"]
 
 
 def describe(gl_name: str, *, native: bool) -> dict[str, Any]:

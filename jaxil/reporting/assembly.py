@@ -84,9 +84,8 @@ def write_report(
     plotted = [*sheets.values(), *(episode.sheet for episode in filmed)]
     plotted += [figure.sheet for figure in paper_figures]
     with folders.replaced(output) as folder:
-        for sheet in plotted:
-            if sheet is not None:
-                write(sheet, folder / "figures")
+        for sheet in filter(None, plotted):
+            write(sheet, folder / "figures")
         for table in (settings, *on_page, *as_files):
             if table.rows:
                 path = folder / "tables" / f"{table.name}.csv"

@@ -58,15 +58,10 @@ def bar_sheet(groups: Sequence[Group], name: str) -> Sheet | None:
             continue
         experts = {round(f.expert, 1) for f in finals if np.isfinite(f.expert)}
         name_of_axis = "task return" + (", expert dashed" if experts else "")
-        rows = [
-            plots.Bar(
-                final.group,
-                final.returns,
-                final.mean,
-                final.group.num_finished < len(final.group.runs),
-            )
-            for final in finals
-        ]
+        rows = []
+        for group, returns, mean, *_ in finals:
+            is_hatched = group.num_finished < len(group.runs)
+            rows.append(plots.Bar(group, returns, mean, is_hatched))
         panels.append(_bar_panel(task, rows, levels=sorted(experts), name=name_of_axis))
     caption = (
         "Mean over seeds of the last evaluation's mean return, its 90 % confidence "

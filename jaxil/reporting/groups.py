@@ -156,9 +156,9 @@ def task_order(task: str) -> tuple[int, str]:
 
 
 def expert_returns(groups: Iterable[Group]) -> list[tuple[float, list[str]]]:
-    """Returns the different experts of one task's runs: the mean return of each.
+    """Returns the different experts of one task's runs, the best one first.
 
-    They fall, and come with the labels of the groups that imitate the expert.
+    Each is its mean return, with the labels of the groups that imitate it.
     """
     experts: list[tuple[float, list[str]]] = []
     found = [

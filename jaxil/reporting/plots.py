@@ -36,13 +36,10 @@ def curves(
     levels: Sequence[tuple[float, str]] = (),
     name: str,
 ) -> None:
-    """Plots the mean of each group with its interval.
+    """Plots the mean of each group with its interval, over frames or over hours.
 
-    Args:
-      axes: to plot on.
-      lines: at least one, all over the same.
-      levels: heights to mark with a dashed line, and their names; highest first.
-      name: of the vertical axis.
+    A dashed line marks each of `levels`, (height, its name), which fall; `name` is that
+    of the vertical axis.
     """
     for line in lines:
         _line(axes, line)
@@ -84,13 +81,9 @@ class Bar(NamedTuple):
 def bars(
     axes: Axes, rows: Sequence[Bar], *, levels: Sequence[float] = (), name: str
 ) -> None:
-    """Plots a bar for each group.
+    """Plots bars from top to bottom.
 
-    Args:
-      axes: to plot on.
-      rows: from top to bottom, at least one.
-      levels: values to mark with a dashed line.
-      name: of the horizontal axis.
+    A dashed line marks each of `levels`; `name` is that of the horizontal axis.
     """
     highest = max([1.0, *levels, *(float(bar.values.max()) for bar in rows)])
     # The interval of two seeds can be many times as long as their bar.
@@ -225,13 +218,13 @@ def alignment(axes: Axes, filmed: Filmed) -> None:
     for strip, end, low in zip(strips, ends, (1.0 - _STRIP, 0.0)):
         extent = (0, end, low, low + _STRIP)
         axes.imshow(np.concatenate([*strip], axis=1), extent=extent, aspect="auto")
-    lines, widths, colours = [], [], []
     rows = np.linspace(0, len(shares) - 1, min(_MAX_MATCHES, len(shares))).round()
-    for row in rows.astype(int):
-        column = int(shares[row].argmax())
-        lines.append([(step * row, 1.0 - _STRIP), (step * column, _STRIP)])
-        widths.append(np.interp(shares[row, column], (0.0, 1.0), _LINE_WIDTHS))
-        colours.append(colormaps["viridis"](row / len(shares)))
+    rows = rows.astype(int)
+    columns = shares[rows].argmax(axis=1)
+    pairs = zip(rows, columns)
+    lines = [[(step * r, 1.0 - _STRIP), (step * c, _STRIP)] for r, c in pairs]
+    widths = np.interp(shares[rows, columns], (0.0, 1.0), _LINE_WIDTHS)
+    colours = colormaps["viridis"](rows / len(shares))
     axes.add_collection(LineCollection(lines, linewidths=widths, colors=colours))
     axes.set_xlim(0, max(ends))
     axes.set_ylim(0, 1)

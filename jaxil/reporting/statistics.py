@@ -20,13 +20,9 @@ class Estimate(NamedTuple):
 
 
 def mean_interval(values: np.ndarray) -> Estimate:
-    """Returns the mean over the first axis with Student's t interval.
+    """Returns the mean over S seeds, [S, ...] to [...], with Student's t interval.
 
-    Args:
-      values: one row for each seed; NaN is missing. Shape [S, ...], S >= 0.
-
-    Returns:
-      Arrays of shape [...]; the interval is NaN where there are fewer than two values.
+    NaN is missing, and S may be 0. The interval needs two values, else it is NaN.
     """
     present = np.ma.masked_invalid(np.asarray(values, np.float64))
     count = present.count(axis=0)
@@ -98,15 +94,13 @@ def first_reaching(x: np.ndarray, y: np.ndarray, level: float) -> float:
 def mean_until(x: np.ndarray, y: np.ndarray, end: float) -> float:
     """Returns the mean height of a curve from 0 to `end`: its area there over `end`.
 
-    The curve is linear between its points, and from zero at x = 0 to the first one.
+    The curve is linear between its points, and from zero at x = 0 to the first one. The
+    result is NaN if it ends before `end`.
 
     Args:
       x: positive, strictly rising. Shape [X].
       y: shape [X].
       end: positive.
-
-    Returns:
-      NaN where the curve ends before.
     """
     if not len(x) or x[-1] < end:
         return float("nan")
