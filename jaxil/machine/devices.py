@@ -50,9 +50,8 @@ def instruction_set() -> str:
     Home folders are shared between machines, and code compiled for one processor may
     contain instructions that another lacks.
     """
-    return "\n".join(
-        sorted({s for s in _cpuinfo() if s.startswith(("model name", "flags"))})
-    )
+    lines = {s for s in _cpuinfo() if s.startswith(("model name", "flags"))}
+    return "\n".join(sorted(lines))
 
 
 def device_name() -> str:

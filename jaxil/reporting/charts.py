@@ -104,12 +104,12 @@ def logit_sheet(groups: Sequence[Group]) -> Sheet | None:
     for task, task_groups in tasks_of(groups).items():
         pairs = []
         for group in task_groups:
-            expert, agent = (
-                measures.curve(group, "frame", column, table="training")
+            both = (
+                measures.curves([group], "frame", column, table="training")
                 for column in _LOGITS
             )
-            if expert is not None and agent is not None:
-                pairs.append((expert, agent))
+            for pair in zip(*both):  # one, of expert and agent, or none
+                pairs.append(pair)
                 # Dashes mean something else here: the legend shows colours only.
                 shown.append(group._replace(look=group.look._replace(dashes=())))
         if pairs:

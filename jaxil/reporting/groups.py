@@ -110,18 +110,14 @@ def differing_fields(runs: Sequence[Run]) -> list[str]:
     Presets set some of them for each task, which a task's name already says.
     """
 
-    def differs(field: str) -> bool:
-        values: dict[str, set[str]] = {}
-        for run in runs:
-            values.setdefault(run.task, set()).add(repr(run.config.get(field)))
-        return any(len(each) > 1 for each in values.values())
-
-    return sorted(
-        field
-        for field in {field for run in runs for field in run.config}
-        if all(_has(run, field) and _matters(run, field) for run in runs)
-        and differs(field)
-    )
+    num_tasks = len({run.task for run in runs})
+    found = []
+    for field in sorted({field for run in runs for field in run.config}):
+        values = {(run.task, repr(run.config.get(field))) for run in runs}
+        matters = all(_has(run, field) and _matters(run, field) for run in runs)
+        if matters and len(values) > num_tasks:  # some task has two values
+            found.append(field)
+    return found
 
 
 def changes(run: Run) -> dict[str, Any]:

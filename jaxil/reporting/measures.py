@@ -48,29 +48,24 @@ class Early(NamedTuple):
 def curves(
     groups: Iterable[Group], over: str, column: str, *, table: str = "evaluation"
 ) -> list[Curve]:
-    """Returns the curves of those groups that have one; see `curve`."""
-    found = (curve(group, over, column, table=table) for group in groups)
-    return [line for line in found if line is not None]
-
-
-def curve(
-    group: Group, over: str, column: str, *, table: str = "evaluation"
-) -> Curve | None:
-    """Joins the seeds of a group; None if none has such a column.
+    """Joins the seeds of each group; leaves out groups that have no such column.
 
     `over` is "frame" or "hours"; `table`, "evaluation" or "training", has the column.
     """
-    pieces = [_series(getattr(run, table), over, column) for run in group.runs]
-    found = [piece for piece in pieces if len(piece[0])]
-    if not found:
-        return None
-    joined, values = statistics.join_curves(found)
-    if len(joined) > _MAX_POINTS:
-        shown = np.linspace(0, len(joined) - 1, _MAX_POINTS).round().astype(int)
-        joined, values = joined[shown], values[:, shown]
-    count = (~np.isnan(values)).sum(axis=0)
-    mean = statistics.mean_interval(values)
-    return Curve(group, over, joined, mean, count, len(found))
+    found = []
+    for group in groups:
+        pieces = [_series(getattr(run, table), over, column) for run in group.runs]
+        pieces = [piece for piece in pieces if len(piece[0])]
+        if not pieces:
+            continue
+        x, values = statistics.join_curves(pieces)
+        if len(x) > _MAX_POINTS:
+            shown = np.linspace(0, len(x) - 1, _MAX_POINTS).round().astype(int)
+            x, values = x[shown], values[:, shown]
+        count = (~np.isnan(values)).sum(axis=0)
+        mean = statistics.mean_interval(values)
+        found.append(Curve(group, over, x, mean, count, len(pieces)))
+    return found
 
 
 def finals(groups: Iterable[Group]) -> list[Final]:
