@@ -3,7 +3,7 @@
 import itertools
 import pathlib
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from jaxil.demonstrations.readers.recording import (
     checked,
 )
 from jaxil.demonstrations.readers.sandbox import read_in_child
+from jaxil.demonstrations.types import Demonstrations, Wanted, returns_of
 from jaxil.errors import printable
 from jaxil.files.untrusted import require_regular
 
@@ -50,47 +51,27 @@ FORMATS = (
     "LeRobot v3 datasets"
 )
 
-
-class PixelEpisodes(NamedTuple):
-    """K episodes, padded to the longest."""
-
-    recording: Recording  # its episodes are exhausted
-    frames: np.ndarray  # uint8 [K, N + 1, S, S, 3], padded with the last frame
-    num_frames: np.ndarray  # without padding. Shape [K]
-    actions: np.ndarray | None  # float32 [K, N, A], padded with zeros; None if unknown
-    rewards: np.ndarray | None  # float32 [K, N], padded with zeros; None if unknown
-    stored_size: tuple[int, int]  # height and width of the first episode in the file
+# How many of a file's frames make an agent step; the nearest one is taken.
+FramesPerStep = Callable[[Recording], float]
 
 
 def open_recording(
     path: pathlib.Path,
     *,
-    max_bytes: int,
-    frame_skip: int = 1,
-    image_size: int | None = None,
-    keep_aspect: bool = False,
-    fit: str = "stretch",
-    camera: str = "",
     action_repeat: int = 0,
-    frames_per_step: Callable[[Recording], float] | None = None,
+    frames_per_step: FramesPerStep | None = None,
+    **options: Any,
 ) -> Recording:
-    """Opens a file or folder; its content decides the format.
+    """Opens a file or folder, whose content decides the format.
+
+    The episodes are checked as they are read. Rewards of skipped frames are summed.
 
     Args:
       path: file or folder.
-      max_bytes: limit of each unpacked array.
-      frame_skip: keeps every n-th frame, and sums the rewards in between.
-      image_size: height and width of the frames; None keeps the file's.
-      keep_aspect: only shrinks videos and pictures, until their shorter side is
-        `image_size`; other formats keep their size.
-      fit: how frames become squares, see `frames.resized`.
-      camera: of a dataset with several.
       action_repeat: of the stored steps, if the file does not say it; 0 if unknown.
-      frames_per_step: samples frames by time: how many of the file's make an agent
-        step. The nearest one is taken.
-
-    Returns:
-      The recording, whose episodes are checked as they are read.
+      frames_per_step: samples frames by time; None takes every `frame_skip`-th.
+      options: the fields of `ReadOptions`. With `keep_aspect`, formats other than
+        videos and pictures keep their size.
 
     Raises:
       FormatError: unknown format, or the file breaks its format's rules.
@@ -102,24 +83,22 @@ def open_recording(
     reader = next((reader for reader in _READERS if reader.recognises(path)), None)
     if reader is None:
         raise FormatError(f"is cut off, damaged or in an unsupported format: {FORMATS}")
-    options = ReadOptions(
-        max_bytes, frame_skip, image_size, keep_aspect, fit=fit, camera=camera
-    )
+    asked = ReadOptions(**options)
     if reader in _IN_PROCESS:
-        items = checked(reader.read(path, options))
+        items = checked(reader.read(path, asked))
     else:
-        items = read_in_child(reader.read, path, options)
+        items = read_in_child(reader.read, path, asked)
     recording = next(items)
     repeat = recording.action_repeat or action_repeat or None
     speed = recording.frames_per_second
+    stride: float = asked.frame_skip
     if reader is videos:  # it skips frames itself, and its frame rate says so
-        repeat, frame_skip = repeat and repeat * frame_skip, 1
+        repeat, stride = repeat and repeat * asked.frame_skip, 1
     recording = recording._replace(action_repeat=repeat)
-    stride: float = frame_skip
     if frames_per_step is not None:
         stride = frames_per_step(recording)
     return recording._replace(
-        episodes=_fitted(items, stride, options),
+        episodes=_fitted(items, stride, asked),
         task=recording.task and printable(recording.task),
         origin=recording.origin and printable(recording.origin, 200),
         action_repeat=repeat and round(repeat * stride),
@@ -129,25 +108,28 @@ def open_recording(
 
 
 def read_episodes(
-    path: pathlib.Path,
-    *,
-    num_episodes: int,
-    image_size: int,
-    max_bytes: int,
-    takes_fewer: bool = False,
-    **how: Any,
-) -> PixelEpisodes:
+    path: pathlib.Path, wanted: Wanted, frames_per_step: FramesPerStep | None
+) -> Demonstrations:
     """Reads the first episodes, resized with antialiasing.
 
-    `max_bytes` limits the arrays of the result together and every intermediate one;
-    `takes_fewer` accepts fewer episodes than `num_episodes`; for the other arguments
-    see `open_recording`.
+    `max_bytes` limits all arrays of the result together, and every intermediate one.
 
     Raises:
       FormatError: see `open_recording`; or too few episodes, or too many bytes.
     """
-    recording = open_recording(path, max_bytes=max_bytes, image_size=image_size, **how)
-    if takes_fewer:
+    image_size, max_bytes = wanted.image_size, wanted.max_bytes
+    recording = open_recording(
+        path,
+        action_repeat=wanted.stated_action_repeat,
+        frames_per_step=frames_per_step,
+        max_bytes=max_bytes,
+        frame_skip=wanted.frame_skip,
+        image_size=image_size,
+        fit=wanted.fit,
+        camera=wanted.dataset_camera,
+    )
+    num_episodes = wanted.num_episodes
+    if wanted.takes_fewer:
         num_episodes = min(num_episodes, recording.num_episodes)
     if num_episodes > recording.num_episodes:
         raise FormatError(
@@ -168,13 +150,22 @@ def read_episodes(
             )
     if len(episodes) < num_episodes:
         raise FormatError(f"ends after {len(episodes)} of {num_episodes} episodes")
-    return PixelEpisodes(
-        recording,
-        _padded([episode.frames for episode in episodes], repeat_last=True),
-        np.array([len(episode.frames) for episode in episodes]),
-        _stacked("actions", [episode.actions for episode in episodes]),
-        _stacked("rewards", [episode.rewards for episode in episodes]),
-        episodes[0].stored_size or (image_size, image_size),
+    rewards = _stacked("rewards", [episode.rewards for episode in episodes])
+    return Demonstrations(
+        frames=_padded([episode.frames for episode in episodes], repeat_last=True),
+        num_frames=np.array([len(episode.frames) for episode in episodes]),
+        actions=_stacked("actions", [episode.actions for episode in episodes]),
+        task_rewards=rewards,
+        metadata={
+            "task": recording.task,
+            "file": str(path),
+            "kind": recording.kind,
+            "action_repeat": recording.action_repeat,
+            "frames_per_second": recording.frames_per_second,
+            "stored_size": episodes[0].stored_size,
+            "notes": recording.notes,
+            "returns": returns_of(rewards),
+        },
     )
 
 
@@ -185,6 +176,7 @@ def _fitted(
     image_size = None if options.keep_aspect else options.image_size
     for index, episode in enumerate(item for item in items if item is not None):
         frames, actions, rewards, stored_size = episode
+        stored_size = stored_size or frames.shape[1:3]
         num_steps = int((len(frames) - 1) / stride + 1e-6)
         if num_steps < 1:
             what = f"has {len(frames)} frames in episode {index}"
@@ -205,13 +197,12 @@ def _fitted(
             if rewards is not None:
                 sums = np.append(0.0, np.cumsum(rewards, dtype=np.float64))
                 rewards = np.diff(sums[times]).astype(np.float32)
-        height, width = stored_size or frames.shape[1:3]
         if image_size is not None and frames.shape[1:3] != (image_size, image_size):
             num_bytes = len(frames) * image_size**2 * 3
             options.check_bytes(f"frames at {image_size}x{image_size}", num_bytes)
             size = (image_size, image_size)
             frames = np.stack([resized(x, size, options.fit) for x in frames])
-        yield PixelEpisode(frames, actions, rewards, (height, width))
+        yield PixelEpisode(frames, actions, rewards, stored_size)
 
 
 def _stacked(name: str, values: list[np.ndarray | None]) -> np.ndarray | None:

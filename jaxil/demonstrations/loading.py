@@ -4,79 +4,17 @@ import functools
 import os
 import pathlib
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from jaxil.demonstrations import foreign, mismatch, rendering, states
 from jaxil.demonstrations.readers.recording import FormatError, Recording
 from jaxil.demonstrations.states import StateDemonstrations, fault, unreadable
+from jaxil.demonstrations.types import Demonstrations, Wanted, returns_of
 from jaxil.environments import suite, tasks
-from jaxil.files import archive
 
 _WAY_OUT = "`jaxil collect --inspect=FILE` shows what a file holds"
-
-
-class Demonstrations(NamedTuple):
-    """K expert episodes, frames not stacked, padded to the longest.
-
-    Attributes:
-      frames: uint8 [K, N + 1, H, W, 3], or float32 [K, N + 1, S] of observed states;
-        padded with the last frame.
-      num_frames: without padding. Shape [K].
-      actions: float32 [K, N, A]; None if unknown.
-      task_rewards: float32 [K, N]; None if unknown. Only for logs.
-      metadata: the file's, and for the steps above `file`, the path; `action_repeat`,
-        None if unknown; and `returns`, one per episode, or an empty list if unknown.
-    """
-
-    frames: np.ndarray
-    num_frames: np.ndarray
-    actions: np.ndarray | None
-    task_rewards: np.ndarray | None
-    metadata: dict[str, Any]
-
-    def mean_return(self) -> float | None:
-        """Returns the mean task return; None if rewards are unknown."""
-        returns = self.metadata["returns"]
-        return float(np.mean(returns)) if returns else None
-
-
-class Wanted(NamedTuple):
-    """What a run needs of its demonstrations, and how a file is read.
-
-    Attributes:
-      task: such as "walker_walk".
-      num_episodes: the file's first ones.
-      action_repeat: the agent's; a multiple of the one in a file of states. Rewards of
-        merged steps are summed, and the first action is kept.
-      max_episode_frames: of the agent's episodes; 0: the task's own limit. A file whose
-        episodes have another length is warned of.
-      image_size: height and width of the frames.
-      observation: "pixels" or "state".
-      frame_skip: keeps every n-th frame of a file of pixels.
-      sampling: of a file of pixels; "time" takes the frame nearest to each agent step.
-      fit: stretch, crop or pad: how frames of other shapes become squares.
-      dataset_camera: of a dataset with several.
-      stated_action_repeat: of a file of pixels that does not say it; 0 if unknown.
-      takes_fewer: whether fewer episodes will do; the functions here set it where they
-        are not given `num_episodes`.
-      max_bytes: memory limit of the arrays.
-    """
-
-    task: str
-    num_episodes: int = 10
-    action_repeat: int = 2
-    max_episode_frames: int = 0
-    image_size: int = 84
-    observation: str = "pixels"
-    frame_skip: int = 1
-    sampling: str = "frames"
-    fit: str = "stretch"
-    dataset_camera: str = ""
-    stated_action_repeat: int = 0
-    takes_fewer: bool = False
-    max_bytes: int = archive.MAX_BYTES
 
 
 def check(
@@ -114,7 +52,7 @@ def mean_return(source: str | os.PathLike = "", **wanted: Any) -> float | None:
     request = _request(wanted)
     path = _path_of(source, request.task)
     if states.recognises(path):
-        return float(np.mean(_returns(_rewards(*_open_states(path, request)))))
+        return float(np.mean(returns_of(_rewards(*_open_states(path, request)))))
     return _load_pixels(path, request).mean_return()
 
 
@@ -149,17 +87,8 @@ def load(
     if not states.recognises(path):
         loaded = _load_pixels(path, request)
         if warns:
-            mismatch.warn_of_pixels(
-                path,
-                loaded.metadata,
-                loaded.num_frames,
-                image_size=request.image_size,
-                task=request.task,
-                action_repeat=request.action_repeat,
-                max_episode_frames=request.max_episode_frames,
-                fit=request.fit,
-            )
-            mismatch.warn_of_expert(path, request.num_episodes, *loaded[:4])
+            mismatch.warn_of_pixels(path, loaded, request)
+            mismatch.warn_of_expert(path, loaded, request)
         return loaded
     stored, stride = _open_states(path, request)
     metadata = stored.metadata
@@ -185,12 +114,12 @@ def load(
         raise fault(path, f"cannot be rendered ({error})") from error
     num_frames = np.full(len(rewards), rewards.shape[1] + 1)
     actions = stored.actions[:, :used:stride]
-    found = frames, num_frames, actions, rewards
-    if warns:
-        mismatch.warn_of_expert(path, request.num_episodes, *found)
     served = {"file": str(path), "action_repeat": request.action_repeat}
-    metadata = {**metadata, **served, "returns": _returns(rewards)}
-    return Demonstrations(*found, metadata)
+    metadata = {**metadata, **served, "returns": returns_of(rewards)}
+    loaded = Demonstrations(frames, num_frames, actions, rewards, metadata)
+    if warns:
+        mismatch.warn_of_expert(path, loaded, request)
+    return loaded
 
 
 def _request(wanted: dict[str, Any]) -> Wanted:
@@ -202,12 +131,6 @@ def _path_of(source: str | os.PathLike, task: str) -> pathlib.Path:
     if not str(source):
         return states.shipped_path(task)
     return pathlib.Path(os.path.expanduser(source))
-
-
-def _returns(task_rewards: np.ndarray | None) -> list[float]:
-    if task_rewards is None:
-        return []
-    return task_rewards.astype(np.float64).sum(axis=1).tolist()
 
 
 def _rewards(stored: StateDemonstrations, stride: int) -> np.ndarray:
@@ -275,7 +198,6 @@ def _read_pixels(
 ) -> Demonstrations:
     del stamps  # part of the key only
     task, num_episodes, skip = request.task, request.num_episodes, request.frame_skip
-    action_repeat = request.action_repeat
     if request.observation != "pixels":
         what = f"holds pixels or is damaged, but observation={request.observation!r}"
         raise fault(path, what, "Set observation to 'pixels', or use a file of states")
@@ -289,8 +211,8 @@ def _read_pixels(
 
     def frames_per_step(recording: Recording) -> float:
         if recording.action_repeat:
-            return action_repeat / recording.action_repeat
-        seconds, _ = tasks.timing(task, action_repeat)
+            return request.action_repeat / recording.action_repeat
+        seconds, _ = tasks.timing(task, request.action_repeat)
         if not recording.frames_per_second or not seconds:
             raise FormatError(
                 "has no frame rate, so it cannot be sampled by time; set "
@@ -299,38 +221,17 @@ def _read_pixels(
         return recording.frames_per_second * seconds
 
     try:
-        read = foreign.read_episodes(
-            path,
-            num_episodes=num_episodes,
-            image_size=request.image_size,
-            max_bytes=request.max_bytes,
-            takes_fewer=request.takes_fewer,
-            frame_skip=skip,
-            fit=request.fit,
-            camera=request.dataset_camera,
-            action_repeat=request.stated_action_repeat,
-            frames_per_step=frames_per_step if by_time else None,
+        loaded = foreign.read_episodes(
+            path, request, frames_per_step if by_time else None
         )
     except OSError as error:
         raise unreadable(path, error) from error
     except FormatError as error:
         raise fault(path, str(error), _WAY_OUT) from error
-    recording = read.recording
-    if recording.task not in (None, task):
-        raise states.other_task(path, recording.task, task)
-    metadata = {
-        "task": recording.task,
-        "file": str(path),
-        "kind": recording.kind,
-        "action_repeat": recording.action_repeat,
-        "frames_per_second": recording.frames_per_second,
-        "stored_size": read.stored_size,
-        "notes": recording.notes,
-        "returns": _returns(read.rewards),
-    }
-    return Demonstrations(
-        read.frames, read.num_frames, read.actions, read.rewards, metadata
-    )
+    shown = loaded.metadata["task"]
+    if shown not in (None, task):
+        raise states.other_task(path, shown, task)
+    return loaded
 
 
 @functools.cache

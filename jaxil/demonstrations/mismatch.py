@@ -2,10 +2,10 @@
 
 import logging
 import pathlib
-from typing import Any
 
 import numpy as np
 
+from jaxil.demonstrations.types import Demonstrations, Wanted
 from jaxil.environments import suite, tasks
 from jaxil.errors import printable
 
@@ -21,29 +21,18 @@ _FITS = {  # of `demonstrations.fit`
 _logger = logging.getLogger(__name__)
 
 
-def warn_of_pixels(
-    path: pathlib.Path,
-    metadata: dict[str, Any],
-    num_frames: np.ndarray,
-    *,
-    image_size: int,
-    task: str,
-    action_repeat: int,
-    max_episode_frames: int,
-    fit: str,
-) -> None:
-    """Warns where a file of pixels differs from the agent's settings.
-
-    `metadata` and `num_frames` are those of the loaded `Demonstrations`.
-    """
-    size, (height, width) = image_size, metadata["stored_size"]
+def warn_of_pixels(path: pathlib.Path, loaded: Demonstrations, wanted: Wanted) -> None:
+    """Warns where a file of pixels differs from the agent's settings."""
+    metadata, action_repeat = loaded.metadata, wanted.action_repeat
+    size, (height, width) = wanted.image_size, metadata["stored_size"]
     messages = []
-    if metadata["task"] != task or tasks.is_of_suite(task):
+    if metadata["task"] != wanted.task or tasks.is_of_suite(wanted.task):
         messages.append(
             f"{path} ({metadata['kind']}) holds pixels of another renderer: light, "
             "colours and camera may differ from the agent's. See --config.camera."
         )
     if (height, width) != (size, size):
+        fit = wanted.fit
         how = "" if height == width else f", {_FITS[fit]} (demonstrations.fit={fit})"
         messages.append(
             f"{path}: frames of {width}x{height} pixels are resized to {size}x{size}"
@@ -56,16 +45,18 @@ def warn_of_pixels(
             f"{action_repeat}: adjust action_repeat or demonstrations.frame_skip."
         )
     speed = metadata["frames_per_second"]
-    seconds, episode_steps = tasks.timing(task, action_repeat, max_episode_frames)
-    wanted = 1.0 / seconds if seconds else speed
-    if speed and wanted and abs(speed / wanted - 1.0) > _RATE_TOLERANCE:
+    seconds, episode_steps = tasks.timing(
+        wanted.task, action_repeat, wanted.max_episode_frames
+    )
+    agents = 1.0 / seconds if seconds else speed
+    if speed and agents and abs(speed / agents - 1.0) > _RATE_TOLERANCE:
         messages.append(
             f"{path} has {speed:.3g} frames per second, but the agent makes "
-            f"{wanted:.3g} steps: about {speed / wanted:.3g} frames per step. "
+            f"{agents:.3g} steps: about {speed / agents:.3g} frames per step. "
             "Set demonstrations.sampling=time, or adjust demonstrations.frame_skip or "
             "action_repeat."
         )
-    longest = int(num_frames.max()) - 1
+    longest = int(loaded.num_frames.max()) - 1
     if not repeat and not speed and longest != episode_steps:
         messages.append(
             f"{path} does not say its action repeat, and its longest episode has "
@@ -77,22 +68,14 @@ def warn_of_pixels(
         _logger.warning("%s", printable(message))
 
 
-def warn_of_expert(
-    path: pathlib.Path,
-    num_wanted: int,
-    frames: np.ndarray,
-    num_frames: np.ndarray,
-    actions: np.ndarray | None,
-    rewards: np.ndarray | None,
-) -> None:
-    """Warns of episodes from which nothing, or the wrong thing, can be learned.
-
-    The arrays are those of the loaded `Demonstrations`, of which `num_wanted` were
-    asked for.
-    """
+def warn_of_expert(path: pathlib.Path, loaded: Demonstrations, wanted: Wanted) -> None:
+    """Warns of episodes from which nothing, or the wrong thing, can be learned."""
+    frames, num_frames, actions, rewards, _ = loaded
     messages = []
-    if len(frames) < num_wanted:
-        messages.append(f"holds {len(frames)} of {num_wanted} episodes: all are used.")
+    if len(frames) < wanted.num_episodes:
+        messages.append(
+            f"holds {len(frames)} of {wanted.num_episodes} episodes: all are used."
+        )
     if actions is not None and np.abs(actions).max(initial=0.0) > _LARGEST_ACTION:
         messages.append(
             f"has actions from {actions.min():.3g} to {actions.max():.3g}, but the "

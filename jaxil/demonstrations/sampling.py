@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxil.demonstrations.loading import Demonstrations
+from jaxil.demonstrations.types import Demonstrations
 from jaxil.maths.stacking import stack_times
 from jaxil.maths.types import ExpertBatch
 from jaxil.replay.stacking import gather_stacks
