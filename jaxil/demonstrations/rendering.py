@@ -84,38 +84,21 @@ def observe_episodes(
     with tasks.make_environment(**settings) as environment:
         if not isinstance(environment, suite.SuiteEnvironment):
             raise ValueError(f"holds simulator states, which {task} cannot take")
-        spec = environment.observation_spec()
         num_episodes, length = states["qpos"].shape[:2]
+        spec = environment.observation_spec()
         observed = np.empty((num_episodes, length, *spec.shape), spec.dtype)
-        of_episode = [
-            {name: array[index] for name, array in states.items()}
-            for index in range(num_episodes)
-        ]
-        paths: list[pathlib.Path] = []
-        if cache and observation == "pixels":
-            about = {
-                "task": task,
-                "seed": seed,
-                "image_size": image_size,
-                "render_quality": render_quality,
-                "camera": camera or suite.camera_of(task),
-                "versions": suite.simulator_versions(),
-                "gl": environment.renderer.gl_name(),
-                "cache_version": _CACHE_VERSION,
-            }
-            if distraction != "none":
-                about["distraction"] = distraction
-            if tasks.names_code(task):  # which may have changed
-                about["model"] = environment.model_digest()
-            paths = [
-                _cache_path({**about, "episode": first_episode + index}, each)
-                for index, each in enumerate(of_episode)
-            ]
+        numbers = range(first_episode, first_episode + num_episodes)
+        images = dict(zip(numbers, observed, strict=True))  # views, by episode
         missing = {
-            index: each
-            for index, each in enumerate(of_episode)
-            if not paths or not _read_cached(paths[index], observed[index])
+            number: {name: array[index] for name, array in states.items()}
+            for index, number in enumerate(numbers)
         }
+        paths: dict[int, pathlib.Path] = {}
+        if cache and observation == "pixels":
+            paths = _cache_paths(environment, settings, missing)
+            for number, path in paths.items():
+                if _read_cached(path, images[number]):
+                    del missing[number]
         num_rendered = (num_episodes - len(missing)) * length
 
         def show(num_images: int) -> None:
@@ -124,10 +107,10 @@ def observe_episodes(
             if progress is not None:
                 progress(num_rendered, num_episodes * length)
 
-        def finish(index: int) -> None:
-            del missing[index]
+        def finish(number: int) -> None:
+            del missing[number]
             if paths:
-                _write_cached(paths[index], observed[index])
+                _write_cached(paths[number], images[number])
 
         if observation != "pixels":
             processes = 1
@@ -137,21 +120,20 @@ def observe_episodes(
         if processes > 1 and len(missing) > 1:
             rendered = _render_together(
                 min(processes, len(missing)),
-                {first_episode + index: each for index, each in missing.items()},
+                dict(missing),
                 settings,
                 environment.renderer.gl_name(),
             )
             with contextlib.closing(rendered):
-                for number, images in rendered:
-                    observed[number - first_episode] = images
-                    finish(number - first_episode)
+                for number, found in rendered:
+                    images[number][:] = found
+                    finish(number)
                     show(length)
-        for index, each in list(missing.items()):
-            images = _observations(environment, first_episode + index, each)
-            for time_index, image in enumerate(images):
-                observed[index, time_index] = image
+        for number, each in list(missing.items()):
+            for time, image in enumerate(_observations(environment, number, each)):
+                images[number][time] = image
                 show(1)
-            finish(index)
+            finish(number)
     return observed
 
 
@@ -260,14 +242,35 @@ def _render_episode(
 _own_environment = functools.cache(tasks.make_environment)
 
 
-def _cache_path(about: dict[str, Any], states: States) -> pathlib.Path:
-    """Returns the cache file of an episode; its name is a hash of all inputs."""
-    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
-    for name, array in sorted(states.items()):
-        digest.update(f"{name}{array.dtype.str}{array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    name = f"{about['task']}-{digest.hexdigest()[:24]}.npz"
-    return cache_folder() / "frames" / name
+def _cache_paths(
+    environment: suite.SuiteEnvironment,
+    settings: dict[str, Any],
+    episodes: dict[int, States],
+) -> dict[int, pathlib.Path]:
+    """Returns each episode's cache file; its name is a hash of all inputs."""
+    task = settings["task"]
+    names = ("task", "seed", "image_size", "render_quality")
+    about = {
+        **{name: settings[name] for name in names},
+        "camera": settings["camera"] or suite.camera_of(task),
+        "versions": suite.simulator_versions(),
+        "gl": environment.renderer.gl_name(),
+        "cache_version": _CACHE_VERSION,
+    }
+    if settings["distraction"] != "none":
+        about["distraction"] = settings["distraction"]
+    if tasks.names_code(task):  # which may have changed
+        about["model"] = environment.model_digest()
+    paths = {}
+    for number, states in episodes.items():
+        key = json.dumps({**about, "episode": number}, sort_keys=True)
+        digest = hashlib.sha256(key.encode())
+        for name, array in sorted(states.items()):
+            digest.update(f"{name}{array.dtype.str}{array.shape}".encode())
+            digest.update(np.ascontiguousarray(array).tobytes())
+        name = f"{task}-{digest.hexdigest()[:24]}.npz"
+        paths[number] = cache_folder() / "frames" / name
+    return paths
 
 
 def _read_cached(path: pathlib.Path, images: np.ndarray) -> bool:
