@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxil import outside
-from jaxil.demonstrations import from_policy
+from jaxil.demonstrations import playing
 from jaxil.demonstrations.states import DemonstrationError
 from jaxil.environments import suite, tasks
 from jaxil.environments.evaluation import evaluate
@@ -145,7 +145,7 @@ def _write(
 ) -> None:
     """Records episodes and prints what they return."""
     try:
-        returns = from_policy.record(
+        returns = playing.record(
             output,
             environment,
             act,

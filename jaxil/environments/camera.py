@@ -1,6 +1,5 @@
 """Renders a simulation at one of three qualities."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,7 @@ _SMOOTH_FACTOR = 2
 # What GL calls renderers that use no GPU.
 _SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software")
 
-# (physics, height and width in pixels, camera index) -> dm_control `Camera`. Raises
-# RuntimeError or ImportError without usable GL.
-OpenCamera = Callable[[Any, int, int], Any]
+missing_gl: list[str] = []  # why the GL backend in MUJOCO_GL is not used
 
 
 def renders_in_software(gl_name: str) -> bool:
@@ -36,7 +33,6 @@ class Renderer:
         self,
         physics: Any,
         *,
-        open_camera: OpenCamera,
         image_size: int,
         camera: int,
         render_quality: str,
@@ -45,15 +41,14 @@ class Renderer:
 
         Args:
           physics: a dm_control `Physics` that has not been rendered yet.
-          open_camera: see `OpenCamera`.
           image_size: height and width in pixels.
           camera: index of a camera of the model.
           render_quality: "paper" for dm_control's defaults; "fast" without
             supersampling, shadows and reflections; "smooth" for "fast" at twice the
             size, averaged over 2x2 pixels.
         """
-        self._physics, self._open_camera = physics, open_camera
-        self.image_size, self._camera_index = image_size, camera
+        self._physics, self._camera_index = physics, camera
+        self.image_size = image_size
         self._flags = None if render_quality == "paper" else _FAST_FLAGS
         self._factor = _SMOOTH_FACTOR if render_quality == "smooth" else 1
         self._camera = None
@@ -92,8 +87,12 @@ class Renderer:
         """Returns the dm_control `Camera`; the first call creates the GL context."""
         if self._camera is None:
             try:
-                self._camera = self._open_camera(
-                    self._physics, self._size, self._camera_index
+                if missing_gl:
+                    raise RuntimeError(missing_gl[0])
+                from dm_control.mujoco import engine
+
+                self._camera = engine.Camera(
+                    self._physics, self._size, self._size, self._camera_index
                 )
             except Exception as error:  # MuJoCo's and GLFW's have no common class
                 raise RuntimeError(

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxil.environments.interaction import Moment
-from jaxil.environments.player import InProcess
+from jaxil.environments.player import InProcess, Moment
 from jaxil.errors import EnvironmentsFailed, raised
 
 # Rendered in software, the heaviest task takes a second per step; imports and the first
@@ -39,7 +38,7 @@ def interrupts_blocked() -> Iterator[None]:
 
 
 class Pool:
-    """Separate processes as `interaction.Environments`.
+    """Separate processes as `player.Environments`.
 
     A process that dies or hangs is replaced when the next episode starts. All processes
     end with the parent, even if it is killed.

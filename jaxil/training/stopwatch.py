@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from jaxil.environments.interaction import Environments
+from jaxil.environments.player import Environments
 
 
 class Stopwatch:

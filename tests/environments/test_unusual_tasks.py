@@ -11,7 +11,7 @@ from dm_control.rl import control
 from dm_control.suite import base
 from dm_control.suite.wrappers import pixels
 
-from jaxil.demonstrations import from_policy
+from jaxil.demonstrations import playing
 from jaxil.demonstrations.readers import own
 from jaxil.environments import observations, suite, tasks
 from tests.own_task import Task, bounded
@@ -124,7 +124,7 @@ def test_what_is_moved_from_outside_is_part_of_a_films_state():
 def test_what_is_moved_from_outside_is_recorded_as_pixels(tmp_path):
     said = []
     with make("moving", image_size=16) as environment:
-        from_policy.record(
+        playing.record(
             tmp_path / "moving.npz",
             environment,
             lambda observation: np.zeros(1),
