@@ -7,10 +7,7 @@ import numpy as np
 RENDER_QUALITIES = ("paper", "fast", "smooth")
 # Shadow maps and supersampling take most of a software renderer's time.
 _FAST_FLAGS = {"shadow": False, "reflection": False}
-# "smooth" renders at twice the size and averages. Otherwise a thin pole jumps between
-# pixels, and small images do not show its speed.
 _SMOOTH_FACTOR = 2
-
 # What GL calls renderers that use no GPU.
 _SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software")
 
@@ -45,7 +42,8 @@ class Renderer:
           camera: index of a camera of the model.
           render_quality: "paper" for dm_control's defaults; "fast" without
             supersampling, shadows and reflections; "smooth" for "fast" at twice the
-            size, averaged over 2x2 pixels.
+            size, averaged over 2x2 pixels. Else a thin pole jumps between pixels, and
+            small images do not show its speed.
         """
         self._physics, self._camera_index = physics, camera
         self.image_size = image_size

@@ -46,10 +46,9 @@ class PixelEnvironment(dm_env.Environment):
         observation: str,
         max_episode_frames: int = 0,
     ):
-        """Wraps `simulator`, a dm_env.Environment; arguments as for `make_environment`.
+        """Wraps a dm_env.Environment; arguments as for `tasks.make_environment`.
 
-        Raises:
-          ValueError: its actions or observations cannot be used.
+        Raises ValueError if its actions or observations cannot be used.
         """
         self._simulator, self._seed = simulator, seed
         self._action_repeat = action_repeat
@@ -95,9 +94,9 @@ class PixelEnvironment(dm_env.Environment):
             )
 
     def reset(self, episode: int | None = None) -> dm_env.TimeStep:
-        """Starts an episode, whose number and the seed determine the initial state.
+        """Starts an episode, by default the next one.
 
-        Without a number it is the one after the last.
+        Its number and the seed determine the initial state.
         """
         if episode is None:
             episode = self._next_episode
@@ -145,15 +144,11 @@ class PixelEnvironment(dm_env.Environment):
         kind = dm_env.StepType.LAST if is_last else dm_env.StepType.MID
         return dm_env.TimeStep(kind, reward, discount, self._observe())
 
-    def action_spec(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self,
-    ) -> specs.BoundedArray:
+    def action_spec(self) -> specs.BoundedArray:  # pyright: ignore
         """Returns the spec of actions: float32 [A] in [-1, 1]."""
         return self._action_spec
 
-    def observation_spec(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self,
-    ) -> specs.Array:
+    def observation_spec(self) -> specs.Array:  # pyright: ignore
         """Returns the spec of stacked pixels, or of the state vector."""
         return self._observation_spec
 
@@ -170,10 +165,9 @@ class PixelEnvironment(dm_env.Environment):
     def render(self, image_size: int | None = None) -> np.ndarray:
         """Returns a new image, uint8 [H, W, 3], of the given size or the agent's."""
         side = image_size or self.image_size
-        image = self._observed_image()
+        image, size = self._observed_image(), (side, side)
         if image is None:
             image = self._rendered(side)
-        size = (side, side)
         if image.shape[:2] == size:
             return np.array(image)
         # Pillow widens its filter where it shrinks an image, which prevents aliasing.
@@ -182,10 +176,7 @@ class PixelEnvironment(dm_env.Environment):
 
     @property
     def own_image_size(self) -> int | None:
-        """Side of the square image that the task itself observes; None without one.
-
-        Known after a reset.
-        """
+        """After a reset: side of the square image that the task observes, or None."""
         shapes = [image.shape[:2] for image in observations.images_in(self._seen)]
         is_square = len(shapes) == 1 and shapes[0][0] == shapes[0][1]
         return shapes[0][0] if is_square else None
@@ -220,10 +211,11 @@ class PixelEnvironment(dm_env.Environment):
     def _own_number(self, name: str) -> float | None:
         """Returns a number that the task may offer, None without it."""
         found = getattr(self._simulator, name, None)
-        number = float(found) if isinstance(found, numbers.Real) else 0.0
-        if found is None or number > 0.0:
-            return None if found is None else number
-        raise ValueError(f"has {name}={found!r}; make it a number above 0, or None")
+        if found is None:
+            return None
+        if not isinstance(found, numbers.Real) or not float(found) > 0.0:
+            raise ValueError(f"has {name}={found!r}; make it a number above 0, or None")
+        return float(found)
 
     def _restart(self, seeds: np.ndarray) -> dm_env.TimeStep:
         """Starts the episode that `seeds`, uint32 [8], determine."""
@@ -252,10 +244,8 @@ class PixelEnvironment(dm_env.Environment):
         scales = getattr(self._simulator, "renders_any_size", False)
         image = np.asarray(render(side) if scales else render())
         if not observations.is_image(image):
-            raise ValueError(
-                f"renders {observations.described(image)}, but uint8 [H, W, 3] is "
-                "expected"
-            )
+            what = f"renders {observations.described(image)}"
+            raise ValueError(f"{what}, but uint8 [H, W, 3] is expected")
         return image
 
     def _state(self) -> np.ndarray:
@@ -302,11 +292,7 @@ def _timestep(function: str, value: Any) -> Any:
 
 
 def _reward(value: Any) -> float:
-    """Returns a task's reward; NaN and infinities are left to what reads it.
-
-    Raises:
-      ValueError: it is no number; dm_env has None at a reset alone.
-    """
+    """Returns a task's reward, which may be NaN, but not None as at a reset."""
     try:
         return float(value)
     except (TypeError, ValueError):
@@ -315,11 +301,7 @@ def _reward(value: Any) -> float:
 
 
 def _discount(value: Any) -> float:
-    """Returns a task's discount.
-
-    Raises:
-      ValueError: it is no number in [0, 1]; dm_env has None at a reset alone.
-    """
+    """Returns a task's discount, which must lie in [0, 1]."""
     try:
         number = float(value)
     except (TypeError, ValueError):

@@ -78,14 +78,10 @@ class InProcess:
 
 @dataclasses.dataclass
 class _Open:
-    """An episode that has begun and not ended.
-
-    Attributes:
-      repeated: actions of an earlier process, with which it begins.
-    """
+    """An episode that has begun and not ended."""
 
     number: int
-    repeated: np.ndarray
+    repeated: np.ndarray  # actions of an earlier process, with which it begins
     observation: np.ndarray | None = None
     is_last: bool = False
     frames: list[np.ndarray] = dataclasses.field(default_factory=list)
@@ -112,8 +108,6 @@ class _Open:
 class Player:
     """Plays episodes: `begin`, `step`, then `observe`, again and again.
 
-    Attribute `next_episode` is the number of the first episode that has not begun.
-
     Episode i starts from the state that `reset(episode=i)` gives, whichever
     environment plays it. A lost environment's episode is played again from its start.
     """
@@ -130,22 +124,19 @@ class Player:
         Args:
           environments: at least one.
           first_episode: number of the first episode that has not begun.
-          open_episodes: actions [t, A] of episodes, by number, that an earlier
-            process had begun: they are repeated, and the episodes go on from there.
+          open_episodes: by number, the actions [t, A] of episodes that an earlier
+            process has begun. They are repeated, and the episodes go on from there.
         """
         self._environments = environments
-        self.next_episode = first_episode
+        self.next_episode = first_episode  # the first that has not begun
         self._waiting = dict(open_episodes or {})  # to be begun first
         self._open: dict[int, _Open] = {}  # by environment
 
     def begin(self, wanted: Callable[[], bool]) -> bool:
         """Starts an episode in each free environment; returns whether any began.
 
-        Args:
-          wanted: asked before each new episode whether to play another.
-
-        Raises:
-          EnvironmentsFailed: see `observe`.
+        `wanted` is asked before each new episode whether to play another. Raises the
+        errors of `observe`.
         """
         begun = []
         for index in range(self._environments.size):
@@ -166,7 +157,9 @@ class Player:
                 if index in self._open:
                     self._step(index, action)
                     self._receive(index)
-                    self._forget_ended(index)
+                if index in self._open and self._open[index].is_last:
+                    # Sooner than when it was first played: its task cannot be seeded.
+                    self._begin_anew(index)
         if begun and not self._open:  # all are to begin anew
             return self.begin(wanted)
         return bool(begun)
@@ -199,13 +192,10 @@ class Player:
             self._step(index, action)
 
     def observe(self) -> list[Episode]:
-        """Waits for the results of the actions.
+        """Waits for the results; returns the episodes that ended, ordered by number.
 
-        Returns:
-          The episodes that ended, in the order of their numbers.
-
-        Raises:
-          EnvironmentsFailed: a task raised an error, or its process keeps dying.
+        Raises EnvironmentsFailed for an error of the task, or if its process keeps
+        dying.
         """
         finished = []
         for index in self._order():
@@ -233,14 +223,6 @@ class Player:
             self._begin_anew(index)
         else:
             self._open[index].add(moment)
-
-    def _forget_ended(self, index: int) -> None:
-        """Drops an episode that ended earlier than when it was first played.
-
-        Its task cannot be seeded, so it did not begin as before.
-        """
-        if index in self._open and self._open[index].is_last:
-            self._begin_anew(index)
 
     def _begin_anew(self, index: int) -> None:
         self._waiting[self._open.pop(index).number] = np.zeros((0, 0))

@@ -45,13 +45,9 @@ class Pool:
     """
 
     def __init__(
-        self,
-        make: Callable[[], Any],
-        size: int,
-        *,
-        say: Callable[[str], None],
+        self, make: Callable[[], Any], size: int, *, say: Callable[[str], None]
     ) -> None:
-        """Starts the processes without waiting for them.
+        """Starts `size` processes without waiting for them.
 
         Args:
           make: makes a `PixelEnvironment`; pickled by name.
@@ -143,11 +139,7 @@ class _Worker:
             self._pipe.send(request)
 
     def receive(self, seconds: float) -> Moment | str:
-        """Returns the result, or why there is none.
-
-        If the environment raised an error, this is the traceback, and `has_raised` is
-        set.
-        """
+        """Returns the result, or why there is none; `has_raised` marks an error."""
         try:
             if not self._pipe.poll(seconds):
                 return f"did not answer for {seconds:g} s"

@@ -57,8 +57,7 @@ def known_tasks() -> tuple[str, ...]:
 def split_task(task: str) -> tuple[str, str]:
     """Splits "ball_in_cup_catch" into ("ball_in_cup", "catch").
 
-    Raises:
-      ValueError: unknown task; names similar ones.
+    Raises ValueError for an unknown task, with similar names.
     """
     for domain, name in _suite().ALL_TASKS:
         if task == f"{domain}_{name}":
@@ -147,10 +146,8 @@ class SuiteEnvironment(PixelEnvironment):
 
         `frame` and `single_observation` show it at once, the stack after the next step.
         Touch and acceleration sensors, which depend on the previous step's forces, are
-        computed without actuation.
-
-        Raises:
-          ValueError: an array does not have the model's shape.
+        computed without actuation. Raises ValueError for shapes that are not the
+        model's.
         """
         data = self.physics.data
         values = {"qpos": qpos, "qvel": qvel, "act": act, **mocap}
@@ -195,10 +192,7 @@ class SuiteEnvironment(PixelEnvironment):
 
 
 def make_environment(task: str, **settings: Any) -> SuiteEnvironment:
-    """Makes one of `known_tasks()`; `settings` are all of `tasks.make_environment`.
-
-    They are checked by `check_settings`.
-    """
+    """Makes one of `known_tasks()`; `settings` are all of `tasks.make_environment`."""
     random = {"random": settings["seed"]}
     simulator = _suite().load(*split_task(task), task_kwargs=random)
     return wrap(simulator, default_camera=camera_of(task), **settings)
@@ -234,10 +228,8 @@ def wrap(
 def camera_index(model: Any, camera: str, default: int = 0) -> int:
     """Returns the index of a camera by its name or number; `default` for "".
 
-    A model without cameras has MuJoCo's free one, of index -1.
-
-    Raises:
-      ValueError: the model has none like that.
+    A model without cameras has MuJoCo's free one, of index -1. Raises ValueError if
+    there is none like that.
     """
     if not camera:
         return default if model.ncam else -1

@@ -47,7 +47,7 @@ def problems(
     """Tries a task: makes it, resets it, takes a step, and looks at it.
 
     Args:
-      task: one of the suite is only made.
+      task: one of the suite is made at most.
       length_problems: faults of an episode of so many agent steps.
       settings: those of `make_environment`.
     """
@@ -132,7 +132,7 @@ def make_environment(
 
 
 def _wrapped(simulator: Any, settings: dict[str, Any]) -> PixelEnvironment:
-    """Returns an environment of one that is not the suite's; takes its settings."""
+    """Returns the environment of a task outside the suite; consumes `settings`."""
     random = getattr(getattr(simulator, "task", None), "random", None)
     is_like_the_suites = isinstance(random, np.random.RandomState)
     shows_itself = hasattr(simulator, "render") or (
@@ -144,28 +144,28 @@ def _wrapped(simulator: Any, settings: dict[str, Any]) -> PixelEnvironment:
         simulator = _DmControl(simulator, settings["camera"])
         settings["camera"] = ""
     del settings["render_quality"]
+    rule = "is for tasks of dm_control's suite"
     for name, without in (("camera", ""), ("distraction", "none")):
         value = settings.pop(name)
         if value != without:
-            raise UsageError(
-                Fault(name, "is for tasks of dm_control's suite", value=value)
-            )
+            raise UsageError(Fault(name, rule, value=value))
     return PixelEnvironment(simulator, **settings)
 
 
 def make_recorded(
     task: str, *, image_size: int | None, **settings: Any
 ) -> PixelEnvironment:
-    """Makes an environment of the task's own observation, to record a policy in it.
+    """Makes an environment in which a policy is recorded.
 
-    That is a state vector, or the image where there is none.
+    It observes the task's own state vector, or the image where there is none; see
+    `make_environment` for the other arguments and the errors.
 
     Args:
-      task: see `make_environment`, as for what is raised and `settings`.
-      image_size: of the images that are recorded. None: the task's own, up to 160
-        pixels and if they are square; otherwise 84. Resized twice, to a file's size
-        and to the agent's, they would differ from what the agent sees, and a
-        discriminator could tell them by that.
+      task: see `make_environment`.
+      image_size: of the recorded images. None takes the task's own if they are square
+        and at most 160 pixels, else 84. Images that are resized twice, for the file
+        and for the agent, differ from the agent's, by which a discriminator could
+        tell them.
     """
 
     def make(side: int) -> PixelEnvironment:
@@ -222,14 +222,12 @@ class _DmControl:
         self.observation_spec = inner.observation_spec
 
     def seed(self, number: int) -> None:
-        """Determines the next reset."""
         of_task = getattr(self._inner.task, "random", None)
         random = getattr(self._inner, "random_state", of_task)
         if random is not None:
             random.seed(number)
 
     def render(self, side: int) -> np.ndarray:
-        """Returns the current image, uint8 [side, side, 3]."""
         physics = self._inner.physics  # composer's is a new one after each reset
         frame = physics.model.vis.global_
         frame.offwidth = max(int(frame.offwidth), _LARGEST_RENDERED)
@@ -282,16 +280,13 @@ class _Gymnasium(dm_env.Environment):
         self._is_rendered = False
 
     def seed(self, number: int) -> None:
-        """Determines the next reset."""
         self._next_seed = number
 
     def reset(self) -> dm_env.TimeStep:
-        """Starts an episode."""
         observation, _ = self._inner.reset(seed=self._next_seed)
         return dm_env.restart(observation)
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
-        """Applies an action within the bounds."""
         action = np.clip(action, self._space.low, self._space.high)
         observation, reward, terminated, truncated, _ = self._inner.step(
             action.astype(self._space.dtype)
@@ -303,7 +298,6 @@ class _Gymnasium(dm_env.Environment):
         return dm_env.transition(float(reward), observation)
 
     def render(self) -> Any:
-        """Returns the current image."""
         self._enter_context()
         image = self._inner.render()
         if not self._is_rendered:
@@ -313,16 +307,13 @@ class _Gymnasium(dm_env.Environment):
         return image
 
     def action_spec(self) -> specs.BoundedArray:  # pyright: ignore
-        """Returns the bounds of actions."""
         space = self._space
         return specs.BoundedArray(space.shape, space.dtype, space.low, space.high)
 
     def observation_spec(self) -> Any:
-        """Returns specs of a vector, an image, or a dictionary of them."""
         return _spec_of(self._inner.observation_space)
 
     def close(self) -> None:
-        """Frees the simulation."""
         atexit.unregister(self.close)
         viewer = self._enter_context()
         if viewer is not None:  # else its buffers are freed in another's context
