@@ -218,8 +218,8 @@ def _stacked(name: str, values: list[np.ndarray | None]) -> np.ndarray | None:
 
 def _padded(arrays: list[np.ndarray], *, repeat_last: bool) -> np.ndarray:
     """Stacks arrays [N_k, ...] of different lengths."""
-    longest = max(map(len, arrays))
-    stacked = np.zeros((len(arrays), longest, *arrays[0].shape[1:]), arrays[0].dtype)
+    shape = (len(arrays), max(map(len, arrays)), *arrays[0].shape[1:])
+    stacked = np.zeros(shape, arrays[0].dtype)
     for row, array in zip(stacked, arrays, strict=True):
         row[: len(array)] = array
         if repeat_last:

@@ -84,15 +84,16 @@ def inspect(
         camera=camera,
         frame_skip=frame_skip,
     )
-    fps = recording.frames_per_second
     summaries, pictures, video = [], [], np.empty((0, 1, 1, 3), np.uint8)
     height = width = 0
     for episode in recording.episodes:
         progress(len(summaries), recording.num_episodes)
-        frames, actions, rewards = episode.frames, episode.actions, episode.rewards
-        height, width = episode.stored_size or frames.shape[1:3]
+        frames, actions, rewards, stored_size = episode
+        height, width = stored_size or frames.shape[1:3]
         if len(pictures) < _NUM_ROWS:
-            compared = _evenly(len(frames))
+            # Evenly spaced ones, or all if they are few.
+            spaced = np.linspace(0, len(frames) - 1, _MAX_COMPARED)
+            compared = np.unique(spaced.round().astype(int))
             differing = most_different(np.stack([_small(frames[t]) for t in compared]))
             times = compared[differing]
             pictures.append([Picture(int(t), frames[t].copy()) for t in times])
@@ -106,6 +107,7 @@ def inspect(
                 None if rewards is None else float(rewards.sum()),
             )
         )
+    fps = recording.frames_per_second
     facts = {
         "format": recording.kind,
         "task": recording.task or "unknown",
@@ -115,9 +117,8 @@ def inspect(
     if recording.origin:
         facts["origin"] = recording.origin
     if height != width:
-        facts["shape"] = (
-            "not square: demonstrations.fit=stretch (the default), crop or pad"
-        )
+        ways = "demonstrations.fit=stretch (the default), crop or pad"
+        facts["shape"] = f"not square: {ways}"
     for number, note in enumerate(recording.notes, start=1):
         facts[f"note {number}"] = note
     return Inspection(facts, summaries, pictures, video, fps or _DEFAULT_FPS)
@@ -165,7 +166,7 @@ def _inspect_states(
 def render_recording(path: pathlib.Path, **view: Any) -> Recording:
     """Opens a file of states as a recording that is rendered while it is read.
 
-    `view` is `image_size` and `render_quality`. Raises the errors of `inspect`.
+    For `view` and the errors see `inspect`.
     """
     stored = _read_states(path)
 
@@ -235,15 +236,10 @@ def contact_sheet(inspection: Inspection) -> Image.Image:
 
 
 def most_different(points: np.ndarray) -> np.ndarray:
-    """Returns the indices of the points that differ most, in ascending order.
+    """Returns the ascending indices of at most 8 points [N, D] that differ most.
 
-    They are chosen by farthest-point sampling, which starts with the first point.
-
-    Args:
-      points: shape [N, D], N >= 1.
-
-    Returns:
-      At most 8 indices; fewer if every other point equals a chosen one.
+    Farthest-point sampling, which starts with the first of N >= 1 points and ends when
+    every other point equals a chosen one.
     """
     chosen = [0]
     distances = np.full(len(points), np.inf)
@@ -254,11 +250,6 @@ def most_different(points: np.ndarray) -> np.ndarray:
             break
         chosen.append(int(distances.argmax()))
     return np.sort(chosen)
-
-
-def _evenly(length: int) -> np.ndarray:
-    """Returns evenly spaced indices of a sequence, all of them if it is short."""
-    return np.unique(np.linspace(0, length - 1, _MAX_COMPARED).round().astype(int))
 
 
 def _small(frame: np.ndarray) -> np.ndarray:

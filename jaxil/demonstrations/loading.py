@@ -22,10 +22,8 @@ def check(
 ) -> None:
     """Raises what `load` would raise, without rendering anything.
 
-    Args:
-      source: see `load`.
-      sees_actions: whether the method needs the expert's actions.
-      wanted: the fields of `Wanted`.
+    `sees_actions` says whether the method needs the expert's actions; for the other
+    arguments see `load`.
     """
     request = _request(wanted)
     task, path = request.task, _path_of(source, request.task)
@@ -45,10 +43,7 @@ def check(
 
 
 def mean_return(source: str | os.PathLike = "", **wanted: Any) -> float | None:
-    """Returns the mean task return without rendering; None if unknown.
-
-    For the arguments and errors see `load`.
-    """
+    """Returns the mean task return without rendering; None if unknown. See `load`."""
     request = _request(wanted)
     path = _path_of(source, request.task)
     if states.recognises(path):
@@ -69,14 +64,12 @@ def load(
 ) -> Demonstrations:
     """Loads demonstrations; states are rendered by the agent's own environment.
 
-    Arguments not listed are those of `tasks.make_environment`.
+    Arguments not listed are those of `rendering.observe_episodes`.
 
     Args:
       source: a file or folder of any format in `foreign.FORMATS`; "" for the task's
         shipped states.
-      cache: whether to cache rendered images.
       warns: whether to warn of what differs from the agent's observations.
-      progress: called with (images done, all images) while rendering.
       wanted: the fields of `Wanted`; `task` is required.
 
     Raises:
@@ -163,8 +156,7 @@ def _open_states(
         what = f"has episodes shorter than one step of action_repeat={action_repeat}"
         raise fault(path, what, "Choose a smaller action_repeat")
     if request.observation == "pixels":
-        num_episodes, num_steps = stored.rewards.shape
-        side = request.image_size
+        side, (num_episodes, num_steps) = request.image_size, stored.rewards.shape
         num_bytes = num_episodes * (num_steps // stride + 1) * side**2 * 3
         if num_bytes > request.max_bytes:
             what = f"needs {num_bytes} bytes at {side}x{side} pixels, more than the "

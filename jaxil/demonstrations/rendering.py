@@ -52,7 +52,7 @@ def observe_episodes(
 ) -> np.ndarray:
     """Observes stored episodes with the agent's own environment.
 
-    Arguments not listed are those of `tasks.make_environment`.
+    Arguments and errors not listed are those of `tasks.make_environment`.
 
     Args:
       states: `qpos`, `qvel` and `act`, each of shape [K, N + 1, n].
@@ -67,8 +67,7 @@ def observe_episodes(
       Images, uint8 [K, N + 1, H, W, 3], or states, float32 [K, N + 1, S].
 
     Raises:
-      ValueError: the task has no simulator states, or these do not fit its model; or
-        see `make_environment`.
+      ValueError: the task has no simulator states, or these do not fit its model.
       RuntimeError: rendering is not available.
     """
     settings = {
@@ -140,8 +139,7 @@ def observe_episodes(
 def num_processes(num_pixels: int, gl_name: str) -> int:
     """Returns how many processes render so many pixels in the shortest time."""
     # One process is fast enough on a GPU, where parallel EGL contexts may hang.
-    is_software = renders_in_software(gl_name)
-    if not is_software or num_pixels < _MIN_PARALLEL_PIXELS:
+    if not renders_in_software(gl_name) or num_pixels < _MIN_PARALLEL_PIXELS:
         return 1
     return min(len(os.sched_getaffinity(0)), _MAX_PROCESSES)
 
@@ -149,11 +147,8 @@ def num_processes(num_pixels: int, gl_name: str) -> int:
 def _observations(
     environment: suite.SuiteEnvironment, number: int, states: States
 ) -> Iterator[np.ndarray]:
-    """Yields the frames of an episode, uint8 [H, W, 3], or its state vectors [S].
-
-    The reset restores what is not in the states.
-    """
-    environment.reset(episode=number)
+    """Yields the frames of an episode, uint8 [H, W, 3], or its state vectors [S]."""
+    environment.reset(episode=number)  # restores what is not in the states
     for values in zip(*states.values(), strict=True):
         environment.set_simulator_state(**dict(zip(states, values, strict=True)))
         yield environment.single_observation()
@@ -274,10 +269,7 @@ def _cache_paths(
 
 
 def _read_cached(path: pathlib.Path, images: np.ndarray) -> bool:
-    """Fills `images` from a cached file; returns whether that is whole and fits.
-
-    The archive's checksum of the pixels is verified.
-    """
+    """Fills `images` from a cached file; returns whether that is whole and fits."""
     try:
         limits = {"images": images.nbytes + 1000}
         found = archive.read_archive(path, max_bytes=limits)["images"]

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxil.demonstrations.types import returns_of
 from jaxil.environments import suite
 from jaxil.errors import printable
 from jaxil.files import archive
@@ -47,7 +48,10 @@ _REMAKE = "Record it again with `jaxil collect`, or use another file"
 
 
 class DemonstrationError(ValueError):
-    """Demonstrations cannot be used; the message names file, reason and remedy."""
+    """Demonstrations cannot be used; the message names file, reason and remedy.
+
+    All functions of this module raise it for a file that cannot be read or is invalid.
+    """
 
 
 class StateDemonstrations(NamedTuple):
@@ -83,13 +87,13 @@ def new_metadata(
     """Returns the metadata of newly recorded demonstrations.
 
     Args:
-      task: `domain_task`.
+      task: its name, as in configs.
       action_repeat: environment frames per stored step.
       seed: of the recording environment; with an episode's number it restores what is
         randomized outside the state.
       first_episode: number of the first of K consecutive episodes.
-      expert: how the expert was made, as text.
-      rewards: the task's. Shape [K, T].
+      expert: how the expert was made, in words.
+      rewards: the task's, summed over the action repeat. Shape [K, T].
     """
     return {
         "format": FORMAT,
@@ -103,7 +107,7 @@ def new_metadata(
         "seed": seed,
         "first_episode": first_episode,
         "expert": expert,
-        "returns": np.asarray(rewards, np.float64).sum(axis=1).tolist(),
+        "returns": returns_of(rewards),
     }
 
 
@@ -113,7 +117,7 @@ def shipped_tasks() -> tuple[str, ...]:
 
 
 def shipped_path(task: str) -> pathlib.Path:
-    """Returns the shipped demonstrations of a task, or raises DemonstrationError."""
+    """Returns the file of a task's shipped demonstrations."""
     path = _shipped_folder() / f"{task}.npz"
     if task not in shipped_tasks():
         raise DemonstrationError(
@@ -125,10 +129,7 @@ def shipped_path(task: str) -> pathlib.Path:
 
 
 def located(name: str) -> pathlib.Path:
-    """Returns the path of a file or folder, or of a task's shipped demonstrations.
-
-    Raises DemonstrationError if there is neither.
-    """
+    """Returns the path of a file or folder, or of a task's shipped demonstrations."""
     path = pathlib.Path(name)
     if os.path.exists(path):
         return path
@@ -141,11 +142,7 @@ def located(name: str) -> pathlib.Path:
 
 
 def digest(path: pathlib.Path) -> str:
-    """Returns a digest of the content of a file or folder, whatever its name.
-
-    Raises:
-      DemonstrationError: it cannot be read.
-    """
+    """Returns a digest of the content of a file or folder, whatever its name."""
     total = hashlib.blake2b(digest_size=16)
     try:
         parts = sorted(path.rglob("*")) if path.is_dir() else [path]
@@ -161,7 +158,7 @@ def digest(path: pathlib.Path) -> str:
 
 
 def write_states(path: str | os.PathLike, demonstrations: StateDemonstrations) -> None:
-    """Writes a file atomically; DemonstrationError if the content is invalid."""
+    """Writes a file atomically."""
     path = pathlib.Path(path)
     _check(path, demonstrations)
     arrays = {
@@ -191,9 +188,6 @@ def read_states(
       task: the required task; None for any.
       num_episodes: returns the first ones; None for all.
       takes_fewer: whether fewer episodes than `num_episodes` will do.
-
-    Raises:
-      DemonstrationError: the file cannot be read, is damaged, or does not fit.
     """
     path = pathlib.Path(path)
     limits = dict.fromkeys(_ARRAYS, archive.MAX_BYTES)
@@ -227,7 +221,7 @@ def _shipped_folder() -> pathlib.Path:
 
 
 def fault(path: pathlib.Path, what: str, way_out: str = _REMAKE) -> DemonstrationError:
-    """Returns the error for a file, with a remedy."""
+    """Returns the error for a file; `way_out` is the remedy."""
     return DemonstrationError(f"{printable(path)} {printable(what)}. {way_out}.")
 
 
@@ -242,8 +236,7 @@ def unreadable(path: pathlib.Path, error: OSError) -> DemonstrationError:
 
 
 def _check(path: pathlib.Path, demonstrations: StateDemonstrations) -> None:
-    what = _metadata_fault(demonstrations.metadata) or _array_fault(demonstrations)
-    if what is not None:
+    if what := _metadata_fault(demonstrations.metadata) or _array_fault(demonstrations):
         raise fault(path, what)
 
 
