@@ -52,22 +52,19 @@ class Inspection(NamedTuple):
 def inspect(
     path: pathlib.Path,
     *,
-    max_bytes: int,
-    camera: str = "",
-    frame_skip: int = 1,
+    image_size: int,
+    render_quality: str = "paper",
     progress: Callable[[int, int], None] = lambda done, total: None,
-    **view: Any,
+    **options: Any,
 ) -> Inspection:
     """Reads a demonstration file of any format; renders samples of simulator states.
 
     Args:
       path: file or folder.
-      max_bytes: limit of each unpacked array.
-      camera: of a dataset with several.
-      frame_skip: keeps every n-th frame of pixels.
+      image_size: of rendered states; the shorter side to which videos shrink.
+      render_quality: of states.
       progress: called with (done, all): images of states, or episodes of pixels.
-      view: `image_size` and `render_quality` for states; videos are shrunk until their
-        shorter side is `image_size`.
+      options: for files of pixels, see `foreign.open_recording`.
 
     Raises:
       DemonstrationError: a file of states is damaged.
@@ -75,14 +72,10 @@ def inspect(
       FormatError: another file is damaged or has an unknown format.
     """
     if states.recognises(path):
+        view = {"image_size": image_size, "render_quality": render_quality}
         return _inspect_states(path, progress, view)
     recording = foreign.open_recording(
-        path,
-        max_bytes=max_bytes,
-        image_size=view["image_size"],
-        keep_aspect=True,
-        camera=camera,
-        frame_skip=frame_skip,
+        path, image_size=image_size, keep_aspect=True, **options
     )
     summaries, pictures, video = [], [], np.empty((0, 1, 1, 3), np.uint8)
     height = width = 0
@@ -166,7 +159,7 @@ def _inspect_states(
 def render_recording(path: pathlib.Path, **view: Any) -> Recording:
     """Opens a file of states as a recording that is rendered while it is read.
 
-    For `view` and the errors see `inspect`.
+    `view` is `image_size` and `render_quality`. Raises the errors of `inspect`.
     """
     stored = _read_states(path)
 

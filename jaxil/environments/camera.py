@@ -27,12 +27,7 @@ class Renderer:
     """
 
     def __init__(
-        self,
-        physics: Any,
-        *,
-        image_size: int,
-        camera: int,
-        render_quality: str,
+        self, physics: Any, *, image_size: int, camera: int, render_quality: str
     ):
         """Sets up the model; the first image creates the GL context.
 
@@ -46,7 +41,7 @@ class Renderer:
             small images do not show its speed.
         """
         self._physics, self._camera_index = physics, camera
-        self.image_size = image_size
+        self._image_size = image_size
         self._flags = None if render_quality == "paper" else _FAST_FLAGS
         self._factor = _SMOOTH_FACTOR if render_quality == "smooth" else 1
         self._camera = None
@@ -64,7 +59,7 @@ class Renderer:
     def render(self) -> np.ndarray:
         """Returns a new image, uint8 [H, W, 3]; RuntimeError without usable GL."""
         image = self.open().render(render_flag_overrides=self._flags)
-        n, size = self._factor, self.image_size
+        n, size = self._factor, self._image_size
         if n == 1:
             return image.copy()  # the camera reuses its buffer
         total = np.full((size, size, 3), n * n // 2, np.uint16)

@@ -29,11 +29,6 @@ class Distraction:
         names = (*_COLOURS, *_CAMERA, "tex_data")
         self._own = {name: getattr(physics.model, name).copy() for name in names}
 
-    @property
-    def is_on(self) -> bool:
-        """Whether there is any distraction."""
-        return self._scale > 0.0
-
     def restart(self, seeds: np.ndarray) -> None:
         """Samples the appearance of an episode."""
         rng, model = np.random.default_rng(seeds), self._physics.model

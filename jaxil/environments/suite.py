@@ -99,13 +99,15 @@ class SuiteEnvironment(PixelEnvironment):
             camera=camera,
             render_quality=render_quality,
         )
-        self._distraction = Distraction(simulator.physics, camera, distraction)
+        self._distraction = None
+        if distraction != "none":
+            self._distraction = Distraction(simulator.physics, camera, distraction)
 
     def render(self, image_size: int | None = None) -> np.ndarray:
         """Returns a new image of the agent's size; RuntimeError without usable GL."""
         if image_size not in (None, self.image_size):
             raise ValueError(f"image_size={image_size}: the camera's size is fixed")
-        if self._distraction.is_on:
+        if self._distraction is not None:
             self.renderer.open()
             self._distraction.upload()
         return self.renderer.render()
@@ -182,7 +184,7 @@ class SuiteEnvironment(PixelEnvironment):
 
     def _restart(self, seeds: np.ndarray) -> dm_env.TimeStep:
         self._simulator.task.random.seed(seeds)
-        if self._distraction.is_on:
+        if self._distraction is not None:
             self._distraction.restart(seeds)
         return self._simulator.reset()
 

@@ -11,6 +11,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
+from typing import BinaryIO
 
 import numpy as np
 
@@ -41,13 +42,14 @@ def member_names(path: pathlib.Path) -> frozenset[str]:
 
 
 class Reader:
-    """Reads arrays of an open archive."""
+    """Reads arrays of an archive."""
 
-    def __init__(self, archive: zipfile.ZipFile, file_bytes: int) -> None:
-        """`file_bytes` is the length of its file."""
-        self._archive = archive
-        self._file_bytes = file_bytes
-        self._stored = {info.filename: info for info in archive.infolist()}
+    def __init__(self, file: BinaryIO) -> None:
+        """Opens an archive in a file; raises ValueError if it is damaged."""
+        with _damages_reported():
+            self._archive = zipfile.ZipFile(file)
+        self._file_bytes = os.fstat(file.fileno()).st_size
+        self._stored = {info.filename: info for info in self._archive.infolist()}
 
     def read(self, max_bytes: Mapping[str, int]) -> dict[str, np.ndarray]:
         """Returns arrays; arguments and errors as of `read_archive`."""
@@ -72,16 +74,9 @@ class Reader:
 
 @contextlib.contextmanager
 def opened(path: pathlib.Path) -> Iterator[Reader]:
-    """Opens an archive from which arrays are read one after another.
-
-    Raises:
-      OSError, ValueError: as `read_archive`.
-    """
+    """Opens an archive to read arrays one after another; raises as `read_archive`."""
     with open_regular(path) as file:
-        with _damages_reported():
-            archive = zipfile.ZipFile(file)
-        with archive:
-            yield Reader(archive, os.fstat(file.fileno()).st_size)
+        yield Reader(file)
 
 
 def read_archive(
@@ -157,17 +152,11 @@ def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
 
 
 def write_archive(
-    path: pathlib.Path,
-    arrays: Iterable[tuple[str, np.ndarray]],
-    *,
-    level: int = 6,
+    path: pathlib.Path, arrays: Iterable[tuple[str, np.ndarray]], *, level: int = 6
 ) -> None:
     """Writes named arrays atomically; only one at a time has to be in memory.
 
-    Args:
-      path: its folder is created.
-      arrays: by name.
-      level: of compression: 0 for none, 9 for most.
+    The file's folder is created. `level` is that of compression, from 0 to 9.
     """
     method = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -44,12 +44,8 @@ def wanted_size(stored: tuple[int, int], options: ReadOptions) -> tuple[int, int
 def as_rgb(image: np.ndarray) -> np.ndarray:
     """Returns an image of another kind as uint8 [H, W, 3].
 
-    Args:
-      image: gray [H, W] or [H, W, 1], RGB, or RGBA, whose alpha is dropped; uint8,
-        bool, uint16 of the full range, or floats in [0, 1].
-
-    Raises:
-      FormatError: another type or shape, or floats outside [0, 1].
+    It is gray [H, W] or [H, W, 1], RGB, or RGBA, whose alpha is dropped; of uint8,
+    bool, uint16 of the full range, or floats in [0, 1]. Others raise FormatError.
     """
     if image.ndim < 3 or image.shape[-1] not in (1, 3, 4):
         image = image[..., None]
@@ -69,14 +65,9 @@ def as_rgb(image: np.ndarray) -> np.ndarray:
 def newest_frames(observations: np.ndarray) -> np.ndarray:
     """Returns a copy of the newest frame of each stack, [T, H, W, 3].
 
+    Observations are uint8 [T, 3 n, H, W] or [T, H, W, 3 n], the newest frame last.
     Channels are on the axis of length 3, 6, 9, ...; if that fits height or width too,
-    on the shorter axis.
-
-    Args:
-      observations: uint8 [T, 3 n, H, W] or [T, H, W, 3 n]; the newest frame is last.
-
-    Raises:
-      FormatError: wrong type or shape, or the axis of channels is ambiguous.
+    on the shorter axis. Anything else raises FormatError.
     """
     shape = observations.shape
     if observations.dtype != np.uint8:

@@ -10,7 +10,7 @@ files are opened.
 import contextlib
 import json
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,6 +70,7 @@ class Recording(NamedTuple):
 
 
 Item = Any  # what a reader yields: a Recording, then PixelEpisodes and None
+Read = Callable[[pathlib.Path, ReadOptions], Iterator[Item]]
 
 
 def checked(items: Iterator[Item]) -> Iterator[Item]:
@@ -98,10 +99,9 @@ def checked_episode(index: int, episode: PixelEpisode) -> PixelEpisode:
     if rewards is not None and rewards.shape[1:] == (1,):
         rewards = rewards[:, 0]
     numbers = {"actions": actions, "rewards": rewards}
-    for name, values in numbers.items():
+    for (name, values), axes in zip(numbers.items(), (2, 1), strict=True):
         if values is None:
             continue
-        axes = 2 if name == "actions" else 1
         is_number = values.dtype.kind in "biuf"
         if not is_number or values.ndim != axes or len(values) != len(frames) - 1:
             raise FormatError(

@@ -7,13 +7,14 @@ FormatError.
 import contextlib
 import os
 import pathlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 from jaxil.demonstrations.readers.recording import (
     FormatError,
     Item,
     PixelEpisode,
+    Read,
     ReadOptions,
     Recording,
     checked,
@@ -35,9 +36,7 @@ _REASONS = {
 
 
 def read_in_child(
-    read: Callable[[pathlib.Path, ReadOptions], Iterator[Item]],
-    path: pathlib.Path,
-    options: ReadOptions,
+    read: Read, path: pathlib.Path, options: ReadOptions
 ) -> Iterator[Item]:
     """Yields a reader's checked items from a child process.
 
@@ -72,9 +71,7 @@ def read_in_child(
 
 
 def _serve(
-    read: Callable[[pathlib.Path, ReadOptions], Iterator[Item]],
-    path: pathlib.Path,
-    options: ReadOptions,
+    read: Read, path: pathlib.Path, options: ReadOptions
 ) -> Iterator[dict[str, Any] | None]:
     """Runs a reader in the child."""
     os.environ["HDF5_PLUGIN_PRELOAD"] = "::"  # disables plug-ins
