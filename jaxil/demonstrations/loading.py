@@ -25,8 +25,7 @@ def check(
     `sees_actions` says whether the method needs the expert's actions; for the other
     arguments see `load`.
     """
-    request = _request(wanted)
-    task, path = request.task, _path_of(source, request.task)
+    path, request = _found(source, wanted)
     if states.recognises(path):
         _open_states(path, request)
         return
@@ -35,7 +34,7 @@ def check(
         return
     if loaded.actions is None:
         raise fault(path, "holds no actions", "Use a method that needs none")
-    needed = _model_sizes(task)["actions"]
+    task, needed = request.task, _model_sizes(request.task)["actions"]
     if loaded.actions.shape[2] != needed:
         what = f"has actions of {loaded.actions.shape[2]} numbers"
         way_out = "Use a method that needs no actions"
@@ -44,8 +43,7 @@ def check(
 
 def mean_return(source: str | os.PathLike = "", **wanted: Any) -> float | None:
     """Returns the mean task return without rendering; None if unknown. See `load`."""
-    request = _request(wanted)
-    path = _path_of(source, request.task)
+    path, request = _found(source, wanted)
     if states.recognises(path):
         return float(np.mean(returns_of(_rewards(*_open_states(path, request)))))
     return _load_pixels(path, request).mean_return()
@@ -75,8 +73,7 @@ def load(
     Raises:
       DemonstrationError: the file cannot be read, is damaged, or does not fit.
     """
-    request = _request(wanted)
-    path = _path_of(source, request.task)
+    path, request = _found(source, wanted)
     if not states.recognises(path):
         loaded = _load_pixels(path, request)
         if warns:
@@ -115,15 +112,14 @@ def load(
     return loaded
 
 
-def _request(wanted: dict[str, Any]) -> Wanted:
-    """Returns the request; without `num_episodes`, a file with fewer will do."""
-    return Wanted(**{"takes_fewer": "num_episodes" not in wanted, **wanted})
-
-
-def _path_of(source: str | os.PathLike, task: str) -> pathlib.Path:
+def _found(
+    source: str | os.PathLike, wanted: dict[str, Any]
+) -> tuple[pathlib.Path, Wanted]:
+    """Returns the file, and the request; without `num_episodes`, fewer will do."""
+    request = Wanted(**{"takes_fewer": "num_episodes" not in wanted, **wanted})
     if not str(source):
-        return states.shipped_path(task)
-    return pathlib.Path(os.path.expanduser(source))
+        return states.shipped_path(request.task), request
+    return pathlib.Path(os.path.expanduser(source)), request
 
 
 def _rewards(stored: StateDemonstrations, stride: int) -> np.ndarray:

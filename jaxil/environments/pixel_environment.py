@@ -70,19 +70,12 @@ class PixelEnvironment(dm_env.Environment):
         self._action_low, self._action_high = _action_range(bounds)
         self._action_dtype = bounds.dtype
         self._action_spec = specs.BoundedArray(
-            shape=bounds.shape,
-            dtype=np.float32,
-            minimum=np.float32(-1.0),
-            maximum=np.float32(1.0),
-            name="action",
+            bounds.shape, np.float32, minimum=-1.0, maximum=1.0, name="action"
         )
         if self._renders:
+            shape = (image_size, image_size, 3 * frame_stack)
             self._observation_spec: specs.Array = specs.BoundedArray(
-                shape=(image_size, image_size, 3 * frame_stack),
-                dtype=np.uint8,
-                minimum=0,
-                maximum=255,
-                name="observation",
+                shape, np.uint8, minimum=0, maximum=255, name="observation"
             )
         else:
             parts = observations.states_in(simulator.observation_spec())
@@ -90,7 +83,7 @@ class PixelEnvironment(dm_env.Environment):
             if state_dim == 0:
                 raise ValueError("observes images alone: set observation to 'pixels'.")
             self._observation_spec = specs.Array(
-                shape=(state_dim,), dtype=np.float32, name="observation"
+                (state_dim,), np.float32, name="observation"
             )
 
     def reset(self, episode: int | None = None) -> dm_env.TimeStep:
@@ -139,8 +132,7 @@ class PixelEnvironment(dm_env.Environment):
             is_last = inner.last() or self._frames_played >= self._frame_limit
             if is_last:
                 break
-        self._reset_next_step = is_last
-        self._current = None
+        self._reset_next_step, self._current = is_last, None
         kind = dm_env.StepType.LAST if is_last else dm_env.StepType.MID
         return dm_env.TimeStep(kind, reward, discount, self._observe())
 

@@ -82,7 +82,7 @@ class _Open:
 
     number: int
     repeated: np.ndarray  # actions of an earlier process, with which it begins
-    observation: np.ndarray | None = None
+    observation: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
     is_last: bool = False
     frames: list[np.ndarray] = dataclasses.field(default_factory=list)
     actions: list[np.ndarray] = dataclasses.field(default_factory=list)
@@ -167,8 +167,7 @@ class Player:
     @property
     def observations(self) -> np.ndarray:
         """The open episodes' observations, in the order of their numbers: [E, ...]."""
-        shown = [self._open[index].observation for index in self._order()]
-        return np.stack([each for each in shown if each is not None])
+        return np.stack([self._open[index].observation for index in self._order()])
 
     @property
     def is_playing(self) -> bool:

@@ -22,7 +22,6 @@ from jaxil.demonstrations.readers.recording import (
     PixelEpisode,
     ReadOptions,
     Recording,
-    first_bytes,
     naming,
 )
 
@@ -69,8 +68,4 @@ def _files(path: pathlib.Path) -> list[pathlib.Path]:
         files = sorted(path.iterdir()) if path.is_dir() else [path]
     except (OSError, ValueError):
         return []
-    return [
-        file
-        for file in files
-        if first_bytes(file, len(minari.HDF5_START)) == minari.HDF5_START
-    ]
+    return [file for file in files if minari.is_hdf5(file)]

@@ -24,7 +24,7 @@ from jaxil.demonstrations.readers.recording import (
 from jaxil.files.untrusted import require_regular
 
 _DATA, _METADATA = "main_data.hdf5", "metadata.json"
-HDF5_START, _JPEG = b"\x89HDF\r\n\x1a\n", b"\xff\xd8\xff"
+_HDF5, _JPEG = b"\x89HDF\r\n\x1a\n", b"\xff\xd8\xff"
 _FILTERS = {1, 2, 3, 32000}  # gzip, shuffle, fletcher32, lzf: not plug-ins
 _MAX_RATIO = 1100  # of compression; gzip reaches 1032
 
@@ -37,7 +37,12 @@ def recognises(path: pathlib.Path) -> bool:
         return False
     head = first_bytes(folder / _METADATA, 4096)
     is_described = b'"data_format"' in head and b'"total_episodes"' in head
-    return is_described or first_bytes(folder / _DATA, len(HDF5_START)) == HDF5_START
+    return is_described or is_hdf5(folder / _DATA)
+
+
+def is_hdf5(path: pathlib.Path) -> bool:
+    """Returns whether this is an HDF5 file."""
+    return first_bytes(path, len(_HDF5)) == _HDF5
 
 
 def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
@@ -48,9 +53,8 @@ def read(path: pathlib.Path, options: ReadOptions) -> Iterator[Item]:
     ignored.
     """
     folder = _data_folder(path)
-    metadata = {}  # older datasets have none
-    if (folder / _METADATA).exists():
-        metadata = read_json(folder / _METADATA)
+    described = folder / _METADATA  # older datasets lack it
+    metadata = read_json(described) if described.exists() else {}
     stored_as = metadata.get("data_format", "hdf5")
     if stored_as != "hdf5":
         raise FormatError(f"has data_format={stored_as!r:.50}, not 'hdf5'")
@@ -120,12 +124,10 @@ def _image_in(episode: Any) -> str:
     import h5py
 
     observations = member(episode, "observations")
-    found = [("observations", observations)]
+    found = {"observations": observations}
     if isinstance(observations, h5py.Group):  # a dictionary; `visititems` skips links
-        observations.visititems(
-            lambda path, x: found.append((f"observations/{path}", x))
-        )
-    datasets = {path: x for path, x in found if isinstance(x, h5py.Dataset)}
+        observations.visititems(lambda p, x: found.update({f"observations/{p}": x}))
+    datasets = {path: x for path, x in found.items() if isinstance(x, h5py.Dataset)}
     images = [p for p, x in datasets.items() if _is_plain(x) or _is_jpeg(x)]
     if len(images) != 1:
         listed = ", ".join(f"{p} of {x.dtype} {x.shape}" for p, x in datasets.items())
@@ -184,8 +186,7 @@ def _check(dataset: Any, options: ReadOptions, rows: slice | tuple[()] = ()) -> 
     filters = {plan.get_filter(i)[0] for i in range(plan.get_nfilters())}
     if not filters <= _FILTERS:
         raise FormatError(f"has {name} with unsupported filters {sorted(filters)}")
-    num_bytes = dataset.size * dataset.dtype.itemsize
-    used_bytes = num_bytes
+    num_bytes = used_bytes = dataset.size * dataset.dtype.itemsize
     if isinstance(rows, slice):
         length = len(range(*rows.indices(len(dataset))))
         used_bytes = num_bytes * length // max(len(dataset), 1)
