@@ -129,9 +129,8 @@ def _inspect_states(
     for row in range(num_rows):
         progress(row * _NUM_COLUMNS, total)
         # Compared by their positions, since rendering all of them would take minutes.
-        positions = stored.simulator_states(slice(None), slice(row, row + 1))["qpos"][0]
-        scale = np.maximum(positions.std(axis=0), 1e-6)
-        times = most_different(positions / scale)
+        scale = np.maximum(stored.qpos[row].std(axis=0), 1e-6)
+        times = most_different(stored.qpos[row] / scale)
         frames = _render(stored, row, times, view)
         pictures.append([Picture(int(t), frame) for t, frame in zip(times, frames)])
     before = total - num_steps - 1

@@ -39,29 +39,24 @@ def observe_episodes(
     states: Mapping[str, np.ndarray],
     *,
     task: str,
-    seed: int,
     first_episode: int,
-    image_size: int,
-    render_quality: str,
-    observation: str = "pixels",
-    camera: str = "",
-    distraction: str = "none",
     cache: bool = True,
     progress: Callable[[int, int], None] | None = None,
     processes: int | None = None,
+    **settings: Any,
 ) -> np.ndarray:
     """Observes stored episodes with the agent's own environment.
 
-    Arguments and errors not listed are those of `tasks.make_environment`.
-
     Args:
       states: `qpos`, `qvel` and `act`, each of shape [K, N + 1, n].
-      seed: of the recording environment.
-      first_episode: number of the first episode in that environment. With the seed it
-        restores what is not in the states: targets, terrain.
+      task: see `tasks.make_environment`, as for errors not listed.
+      first_episode: its number in the recording environment, whose seed is among the
+        settings. The two restore what is not in the states: targets, terrain.
       cache: whether to read and write images in `cache_folder()`.
       progress: called with (images done, all images) while rendering.
       processes: None chooses the number. The images do not depend on it.
+      settings: `seed`, `image_size`, `render_quality` and, if they are not those of
+        `make_environment`, `observation`, `camera` and `distraction`.
 
     Returns:
       Images, uint8 [K, N + 1, H, W, 3], or states, float32 [K, N + 1, S].
@@ -70,16 +65,8 @@ def observe_episodes(
       ValueError: the task has no simulator states, or these do not fit its model.
       RuntimeError: rendering is not available.
     """
-    settings = {
-        "task": task,
-        "seed": seed,
-        "image_size": image_size,
-        "frame_stack": 1,
-        "render_quality": render_quality,
-        "observation": observation,
-        "camera": camera,
-        "distraction": distraction,
-    }
+    settings |= {"task": task, "frame_stack": 1}
+    is_rendered = settings.get("observation", "pixels") == "pixels"
     with tasks.make_environment(**settings) as environment:
         if not isinstance(environment, suite.SuiteEnvironment):
             raise ValueError(f"holds simulator states, which {task} cannot take")
@@ -93,7 +80,7 @@ def observe_episodes(
             for index, number in enumerate(numbers)
         }
         paths: dict[int, pathlib.Path] = {}
-        if cache and observation == "pixels":
+        if cache and is_rendered:
             paths = _cache_paths(environment, settings, missing)
             for number, path in paths.items():
                 if _read_cached(path, images[number]):
@@ -111,10 +98,10 @@ def observe_episodes(
             if paths:
                 _write_cached(paths[number], images[number])
 
-        if observation != "pixels":
+        if not is_rendered:
             processes = 1
         elif processes is None:
-            num_pixels = len(missing) * length * image_size**2
+            num_pixels = len(missing) * length * environment.image_size**2
             processes = num_processes(num_pixels, environment.renderer.gl_name())
         if processes > 1 and len(missing) > 1:
             rendered = _render_together(
@@ -243,16 +230,15 @@ def _cache_paths(
     episodes: dict[int, States],
 ) -> dict[int, pathlib.Path]:
     """Returns each episode's cache file; its name is a hash of all inputs."""
-    task = settings["task"]
-    names = ("task", "seed", "image_size", "render_quality")
+    task, names = settings["task"], ("task", "seed", "image_size", "render_quality")
     about = {
         **{name: settings[name] for name in names},
-        "camera": settings["camera"] or suite.camera_of(task),
+        "camera": settings.get("camera") or suite.camera_of(task),
         "versions": suite.simulator_versions(),
         "gl": environment.renderer.gl_name(),
         "cache_version": _CACHE_VERSION,
     }
-    if settings["distraction"] != "none":
+    if settings.get("distraction", "none") != "none":
         about["distraction"] = settings["distraction"]
     if tasks.names_code(task):  # which may have changed
         about["model"] = environment.model_digest()

@@ -40,27 +40,23 @@ class Environments(Protocol):
 
 
 class InProcess:
-    """One environment in this process, as `Environments`: it steps in `receive`."""
+    """A `PixelEnvironment` in this process, as `Environments`: steps in `receive`."""
 
     size = 1
 
     def __init__(self, environment: Any) -> None:
-        """Uses the environment's `reset`, `step` and `single_observation`."""
         self._environment = environment
         self._request: Callable[[], Any] = lambda: None
 
     def reset(self, index: int, episode: int) -> None:
-        """See `Environments`."""
         del index
         self._request = lambda: self._environment.reset(episode=episode)
 
     def step(self, index: int, action: np.ndarray) -> None:
-        """See `Environments`."""
         del index
         self._request = lambda: self._environment.step(action)
 
     def receive(self, index: int) -> Moment:
-        """See `Environments`."""
         del index
         timestep = self._request()
         return Moment(
@@ -72,7 +68,6 @@ class InProcess:
         )
 
     def close(self) -> None:
-        """Closes the environment."""
         self._environment.close()
 
 
@@ -204,7 +199,6 @@ class Player:
         return finished
 
     def close(self) -> None:
-        """Closes the environments."""
         self._environments.close()
 
     def _order(self) -> list[int]:

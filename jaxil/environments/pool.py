@@ -68,7 +68,6 @@ class Pool:
 
     @property
     def pids(self) -> list[int]:
-        """Process ids, by index."""
         return [worker.process.pid or 0 for _, worker in sorted(self._workers.items())]
 
     def reset(self, index: int, episode: int) -> None:
@@ -82,7 +81,6 @@ class Pool:
         self._workers[index].send(("reset", episode))
 
     def step(self, index: int, action: np.ndarray) -> None:
-        """Sends an action, shape [A]."""
         self._workers[index].send(("step", action))
 
     def receive(self, index: int) -> Moment | None:
@@ -111,7 +109,6 @@ class Pool:
         return None
 
     def close(self) -> None:
-        """Ends all processes."""
         for worker in self._workers.values():
             worker.dismiss()
         end = time.monotonic() + _EXIT_SECONDS

@@ -169,12 +169,11 @@ def make_recorded(
     """
 
     def make(side: int) -> PixelEnvironment:
+        how = {"image_size": side, **settings}
         try:
-            return make_environment(
-                task, image_size=side, observation="state", **settings
-            )
+            return make_environment(task, observation="state", **how)
         except ValueError:  # it observes images alone
-            return make_environment(task, image_size=side, frame_stack=1, **settings)
+            return make_environment(task, frame_stack=1, **how)
 
     environment = make(image_size or _RECORDED_SIZE)
     if image_size or is_of_suite(task):
@@ -242,17 +241,13 @@ class _Gymnasium(dm_env.Environment):
     """
 
     def __init__(self, name: str, image_size: int) -> None:
+        task = _GYMNASIUM + name
         try:
             import gymnasium
         except ImportError as error:
-            raise UsageError(
-                Fault(
-                    "task",
-                    "needs Gymnasium, which is not installed",
-                    "in jaxil's folder: pip install '.[gymnasium]'",
-                    _GYMNASIUM + name,
-                )
-            ) from error
+            what = "needs Gymnasium, which is not installed"
+            way_out = "in jaxil's folder: pip install '.[gymnasium]'"
+            raise UsageError(Fault("task", what, way_out, task)) from error
         make = functools.partial(
             gymnasium.make, name, render_mode="rgb_array", disable_env_checker=True
         )
@@ -263,14 +258,12 @@ class _Gymnasium(dm_env.Environment):
                 self._inner.close()
                 self._inner = make(width=image_size, height=image_size)
         except (gymnasium.error.Error, ImportError) as error:
-            raise UsageError(
-                Fault("task", f"cannot be made: {error}", value=_GYMNASIUM + name)
-            ) from error
+            what = f"cannot be made: {error}"
+            raise UsageError(Fault("task", what, value=task)) from error
         space: Any = self._inner.action_space
         if not isinstance(space, gymnasium.spaces.Box):
-            raise ValueError(
-                f"has actions {space}, but needs a vector of numbers (Box)"
-            )
+            needed = "a vector of numbers (Box)"
+            raise ValueError(f"has actions {space}, but needs {needed}")
         self._space = space
         spec, inner = self._inner.spec, self._inner.unwrapped
         self.step_limit = spec and spec.max_episode_steps
