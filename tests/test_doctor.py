@@ -114,7 +114,6 @@ def test_a_source_tree_that_is_not_installed(monkeypatch):
         task="cartpole_swingup",
         action_repeat=2,
         seed=0,
-        first_episode=0,
         expert="none",
         rewards=np.zeros((1, 3)),
     )

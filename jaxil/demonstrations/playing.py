@@ -87,7 +87,6 @@ def record(
                 task=task,
                 action_repeat=action_repeat,
                 seed=seed,
-                first_episode=0,
                 expert=expert,
                 rewards=arrays["rewards"],
             )

@@ -80,18 +80,16 @@ def new_metadata(
     task: str,
     action_repeat: int,
     seed: int,
-    first_episode: int,
     expert: str,
     rewards: np.ndarray,
 ) -> dict[str, Any]:
-    """Returns the metadata of newly recorded demonstrations.
+    """Returns the metadata of newly recorded episodes 0 ... K - 1.
 
     Args:
       task: its name, as in configs.
       action_repeat: environment frames per stored step.
       seed: of the recording environment; with an episode's number it restores what is
         randomized outside the state.
-      first_episode: number of the first of K consecutive episodes.
       expert: how the expert was made, in words.
       rewards: the task's, summed over the action repeat. Shape [K, T].
     """
@@ -105,7 +103,7 @@ def new_metadata(
             "jaxil": devices.version("jaxil") or devices.NOT_INSTALLED,
         },
         "seed": seed,
-        "first_episode": first_episode,
+        "first_episode": 0,
         "expert": expert,
         "returns": returns_of(rewards),
     }

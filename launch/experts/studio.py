@@ -45,7 +45,6 @@ def record(
         task=task,
         action_repeat=ACTION_REPEAT,
         seed=SEED,
-        first_episode=0,
         expert=f"{expert}; {minutes:.1f} minutes of one core; no noise",
         rewards=arrays["rewards"],
     )

@@ -45,10 +45,10 @@ def record():
         task=TASK,
         action_repeat=2,
         seed=SEED,
-        first_episode=FIRST_EPISODE,
         expert="uniform actions",
         rewards=rewards,
     )
+    metadata["first_episode"] = FIRST_EPISODE
     recorded = StateDemonstrations(
         **arrays, actions=actions, rewards=rewards, metadata=metadata
     )
