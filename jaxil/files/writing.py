@@ -18,8 +18,8 @@ def wrong_name(path: str | os.PathLike) -> str | None:
     """Returns why no file can have a path; None if one can."""
     parts = pathlib.Path(path).absolute().parts
     longest = max(parts, key=lambda part: len(os.fsencode(part)))
-    if len(os.fsencode(longest)) > _MAX_NAME_BYTES:
-        length = len(os.fsencode(longest))
+    length = len(os.fsencode(longest))
+    if length > _MAX_NAME_BYTES:
         return f"a name of {length} bytes, {longest[:40]!r}...: at most 255 are allowed"
     return "a zero byte in its name" if any("\0" in part for part in parts) else None
 

@@ -78,7 +78,5 @@ def _serve(
     os.environ["ARROW_DEFAULT_MEMORY_POOL"] = "system"  # others reserve too much
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # silences libraries
     for item in checked(read(path, options)):
-        content = None if item is None else item._asdict()
-        if content is not None:
-            content.pop("episodes", None)
-        yield content
+        # Without the iterator of a Recording's episodes, which cannot be sent.
+        yield item and {k: v for k, v in item._asdict().items() if k != "episodes"}
