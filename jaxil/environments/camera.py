@@ -1,5 +1,6 @@
 """Renders a simulation at one of three qualities."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,9 @@ _SMOOTH_FACTOR = 2
 # What GL calls renderers that use no GPU.
 _SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software")
 
-missing_gl: list[str] = []  # why the GL backend in MUJOCO_GL is not used
+# (physics, height and width in pixels, camera index) -> dm_control `Camera`. Raises
+# RuntimeError or ImportError without usable GL.
+OpenCamera = Callable[[Any, int, int], Any]
 
 
 def renders_in_software(gl_name: str) -> bool:
@@ -27,12 +30,19 @@ class Renderer:
     """
 
     def __init__(
-        self, physics: Any, *, image_size: int, camera: int, render_quality: str
+        self,
+        physics: Any,
+        *,
+        open_camera: OpenCamera,
+        image_size: int,
+        camera: int,
+        render_quality: str,
     ):
         """Sets up the model; the first image creates the GL context.
 
         Args:
           physics: a dm_control `Physics` that has not been rendered yet.
+          open_camera: see `OpenCamera`.
           image_size: height and width in pixels.
           camera: index of a camera of the model.
           render_quality: "paper" for dm_control's defaults; "fast" without
@@ -40,8 +50,8 @@ class Renderer:
             size, averaged over 2x2 pixels. Else a thin pole jumps between pixels, and
             small images do not show its speed.
         """
-        self._physics, self._camera_index = physics, camera
-        self._image_size = image_size
+        self._physics, self._open_camera = physics, open_camera
+        self._image_size, self._camera_index = image_size, camera
         self._flags = None if render_quality == "paper" else _FAST_FLAGS
         self._factor = _SMOOTH_FACTOR if render_quality == "smooth" else 1
         self._camera = None
@@ -80,12 +90,8 @@ class Renderer:
         """Returns the dm_control `Camera`; the first call creates the GL context."""
         if self._camera is None:
             try:
-                if missing_gl:
-                    raise RuntimeError(missing_gl[0])
-                from dm_control.mujoco import engine
-
-                self._camera = engine.Camera(
-                    self._physics, self._size, self._size, self._camera_index
+                self._camera = self._open_camera(
+                    self._physics, self._size, self._camera_index
                 )
             except Exception as error:  # MuJoCo's and GLFW's have no common class
                 raise RuntimeError(

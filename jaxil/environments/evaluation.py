@@ -49,7 +49,7 @@ def evaluate(
       environment: used by nothing else.
       act: the policy.
       num_episodes: at least 1.
-      first_episode: its number, which determines the initial states.
+      first_episode: number of the first, which determines its initial state.
       num_kept: episodes of which the observations are kept.
       record: called at each moment of the first episode; None records nothing.
       stop_asked: called before each agent step; True raises `Stopped`.

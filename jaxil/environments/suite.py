@@ -1,6 +1,6 @@
 """Makes environments of the DeepMind Control Suite.
 
-Only this module and `camera` import dm_control.
+No other module imports dm_control.
 """
 
 import functools
@@ -15,7 +15,7 @@ from typing import Any
 import dm_env
 import numpy as np
 
-from jaxil.environments.camera import RENDER_QUALITIES, Renderer, missing_gl
+from jaxil.environments.camera import RENDER_QUALITIES, Renderer
 from jaxil.environments.distraction import STRENGTHS, Distraction
 from jaxil.environments.observations import flat_state
 from jaxil.environments.pixel_environment import PixelEnvironment
@@ -23,6 +23,7 @@ from jaxil.errors import unknown_name
 from jaxil.machine import startup
 
 OBSERVATIONS = ("pixels", "state")
+_missing_gl: list[str] = []  # why the GL backend in MUJOCO_GL is not used
 
 
 @functools.cache
@@ -38,7 +39,9 @@ def _suite() -> Any:
             raise RuntimeError("there is no display")
         from dm_control import suite
     except (ImportError, RuntimeError, AttributeError) as error:
-        missing_gl.append(f"MUJOCO_GL={backend} does not work here ({error}): unset it")
+        _missing_gl.append(
+            f"MUJOCO_GL={backend} does not work here ({error}): unset it"
+        )
         os.environ["MUJOCO_GL"] = "disable"
         from dm_control import suite
     # MuJoCo warns of an attribute in dm_control's own models, which no user can change.
@@ -95,6 +98,7 @@ class SuiteEnvironment(PixelEnvironment):
         super().__init__(simulator, image_size=image_size, **settings)
         self.renderer = Renderer(
             simulator.physics,
+            open_camera=_open_camera,
             image_size=image_size,
             camera=camera,
             render_quality=render_quality,
@@ -202,11 +206,11 @@ def make_environment(task: str, **settings: Any) -> SuiteEnvironment:
 
 def check_settings(settings: Mapping[str, Any]) -> None:
     """Raises ValueError for an argument of `tasks.make_environment` out of range."""
-    least = {"seed": 0, "action_repeat": 1, "image_size": 1, "frame_stack": 1}
-    for name, number in least.items():
+    lowest = {"seed": 0, "action_repeat": 1, "image_size": 1, "frame_stack": 1}
+    for name, least in lowest.items():
         value = settings[name]
-        if value < number:
-            raise ValueError(f"{name}={value} must be at least {number}.")
+        if value < least:
+            raise ValueError(f"{name}={value} must be at least {least}.")
     choices = {
         "observation": OBSERVATIONS,
         "render_quality": RENDER_QUALITIES,
@@ -242,3 +246,11 @@ def camera_index(model: Any, camera: str, default: int = 0) -> int:
             return known.index(camera)
     listed = ", ".join(f"{i} {n}".strip() for i, n in zip(numbers, names))
     raise ValueError(f"camera={camera!r} is unknown; the task has: {listed}.")
+
+
+def _open_camera(physics: Any, size: int, index: int) -> Any:
+    from dm_control.mujoco import engine
+
+    if _missing_gl:
+        raise RuntimeError(_missing_gl[0])
+    return engine.Camera(physics, height=size, width=size, camera_id=index)
