@@ -23,14 +23,7 @@ def read_into(
 ) -> str | None:
     """Adds one episode, or skips its number if the file is damaged.
 
-    Args:
-      replay: that the episode is added to.
-      folder: of the files.
-      index: the episode's number.
-      checksum: what `write` returned.
-
-    Returns:
-      What is wrong with the file, or None.
+    Returns what is wrong with the file, or None. `checksum` is what `write` returned.
     """
     path = _path(folder, index)
     try:

@@ -12,7 +12,6 @@ import numpy as np
 
 from jaxil.maths.stacking import stack_times
 from jaxil.maths.types import Batch, Window
-from jaxil.replay.episode import require
 from jaxil.replay.ring import EpisodeRing, ring_slots
 from jaxil.replay.stacking import gather_stacks
 
@@ -49,17 +48,8 @@ class Replay(EpisodeRing):
           num_steps: n of the n-step return, >= 1.
           discount_factor: gamma in [0, 1].
           **sizes: see `EpisodeRing`.
-
-        Raises:
-          ValueError: for a number that is out of range.
         """
         super().__init__(**sizes)
-        require(frame_stack >= 1, "frame_stack", frame_stack, ">= 1")
-        require(num_steps >= 1, "num_steps", num_steps, ">= 1")
-        in_range = 0 <= discount_factor <= 1
-        require(in_range, "discount_factor", discount_factor, "in [0, 1]")
-        stackable = self._frames.ndim != 2 or frame_stack == 1
-        require(stackable, "frame_stack", frame_stack, "1 for states")
         self._frame_stack = frame_stack
         self._window = num_steps
         self._discount_factor = discount_factor

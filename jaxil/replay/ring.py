@@ -12,6 +12,7 @@ from jaxil.replay.episode import checked_episode, checked_values, require
 class _Stored(NamedTuple):
     start: int  # slot of the episode's first frame
     num_steps: int
+    total_reward: float
 
 
 class EpisodeRing:
@@ -38,22 +39,11 @@ class EpisodeRing:
           observation_shape: of a single frame, (H, W, C), or of a state, (S,).
           observation_dtype: uint8 for pixels, float32 for states.
           action_dim: A >= 1.
-
-        Raises:
-          ValueError: for a number that is out of range.
         """
-        shape = tuple(observation_shape)
-        require(episode_steps >= 1, "episode_steps", episode_steps, ">= 1")
-        require(len(shape) in (1, 3), "observation_shape", shape, "(H, W, C) or (S,)")
-        require(action_dim >= 1, "action_dim", action_dim, ">= 1")
-        enough = f"room for an episode, {episode_steps} steps"
-        require(
-            capacity_steps >= episode_steps, "capacity_steps", capacity_steps, enough
-        )
         self._capacity_steps = capacity_steps
         slots = ring_slots(capacity_steps, episode_steps)
         # These touch no pages yet, so memory use grows with the run.
-        self._frames = np.empty((slots, *shape), observation_dtype)
+        self._frames = np.empty((slots, *observation_shape), observation_dtype)
         self._actions = np.zeros((slots, action_dim), np.float32)
         self._rewards = np.zeros(slots, np.float32)
         self._discounts = np.zeros(slots, np.float32)
@@ -62,7 +52,6 @@ class EpisodeRing:
     def clear(self, first_episode: int = 0) -> None:
         """Removes all episodes; the next one gets the number `first_episode`."""
         self._stored: dict[int, _Stored] = {}  # by number, the oldest first
-        self._sums: dict[int, float] = {}  # of rewards, likewise
         self._num_episodes_added = first_episode
         self._num_steps_stored = 0
         self._next_slot = 0
@@ -121,9 +110,8 @@ class EpisodeRing:
             # Each episode has one frame more than it has steps.
             or self._num_steps_stored + len(self._stored) + num_steps + 1 > length
         ):
-            oldest = self.oldest_episode
-            self._num_steps_stored -= self._stored.pop(oldest).num_steps
-            del self._sums[oldest]
+            oldest = self._stored.pop(self.oldest_episode)
+            self._num_steps_stored -= oldest.num_steps
             num_removed += 1
         start = self._next_slot
         # In two pieces if it wraps around: slices copy faster than index lists.
@@ -134,8 +122,8 @@ class EpisodeRing:
         self._actions[slots] = actions
         self._rewards[slots] = rewards
         self._discounts[slots] = discounts
-        self._stored[self._num_episodes_added] = _Stored(start, num_steps)
-        self._sums[self._num_episodes_added] = rewards.sum(dtype=np.float64)
+        total_reward = rewards.sum(dtype=np.float64)
+        self._stored[self._num_episodes_added] = _Stored(start, num_steps, total_reward)
         self._starts = np.append(self._starts[num_removed:], start)
         self._lengths = np.append(self._lengths[num_removed:], num_steps)
         self._next_slot = (start + num_steps + 1) % length
@@ -152,7 +140,8 @@ class EpisodeRing:
         slots = self.slots(index)[:-1]
         rewards = checked_values("rewards", rewards, self._rewards[slots])
         self._rewards[slots] = rewards
-        self._sums[index] = rewards.sum(dtype=np.float64)
+        total_reward = rewards.sum(dtype=np.float64)
+        self._stored[index] = self._stored[index]._replace(total_reward=total_reward)
 
     def rewards(self, index: int) -> np.ndarray:
         """Returns a copy of the rewards of a stored episode, [T]."""
@@ -166,7 +155,8 @@ class EpisodeRing:
         """Returns the mean of all stored rewards; NaN if there are none."""
         if not self._stored:
             return math.nan
-        return float(sum(self._sums.values()) / self._num_steps_stored)
+        total = sum(episode.total_reward for episode in self._stored.values())
+        return float(total / self._num_steps_stored)
 
     def episode(self, index: int) -> Episode:
         """Returns a copy of a stored episode; IndexError if it is not stored."""
@@ -186,7 +176,7 @@ class EpisodeRing:
                 f" {len(self._stored)} of the episodes"
                 f" {self.oldest_episode} to {self._num_episodes_added - 1}"
             )
-        start, num_steps = self._stored[index]
+        start, num_steps, _ = self._stored[index]
         return (start + np.arange(num_steps + 1)) % len(self._frames)
 
 

@@ -299,24 +299,6 @@ def test_only_stored_episodes_can_be_read():
             replay.episode(index)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"capacity_steps": 3}, "capacity_steps = 3: expected room for an episode"),
-        ({"episode_steps": 0}, "episode_steps = 0"),
-        ({"observation_shape": (2, 3)}, r"observation_shape = \(2, 3\)"),
-        ({"action_dim": 0}, "action_dim = 0"),
-        ({"frame_stack": 0}, "frame_stack = 0"),
-        ({"frame_stack": 2, "observation_shape": (4,)}, "expected 1 for states"),
-        ({"num_steps": 0}, "num_steps = 0"),
-        ({"discount_factor": 1.1}, r"discount_factor = 1.1: expected in \[0, 1\]"),
-    ],
-)
-def test_bad_sizes_are_refused(changes, message):
-    with pytest.raises(ValueError, match=message):
-        make_replay(**changes)
-
-
 def test_a_skipped_number_leaves_a_gap():
     replay = make_replay()  # of 12 steps
     replay.clear(5)
