@@ -41,12 +41,7 @@ def begin_average(state: TrainState) -> TrainState:
 
 
 def make_averaging_step(step: UpdateStep, *, tau: float) -> UpdateStep:
-    """Returns a learning step that also averages its policies.
-
-    Args:
-      step: any method's.
-      tau: see `average_policy`.
-    """
+    """Returns any method's learning step, which then also averages its policies."""
 
     def averaging_step(
         state: TrainState, batch: Batch, expert: ExpertBatch | None

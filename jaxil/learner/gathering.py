@@ -35,12 +35,7 @@ def gather_batch(frames: Data, batch: Batch) -> Batch:
 
 
 def gather_expert(frames: Data, expert: ExpertBatch) -> ExpertBatch:
-    """Replaces frame indices with stacks.
-
-    Args:
-      frames: see `Frames.expert`.
-      expert: its observations, int32 [B, F], index the concatenated episodes.
-    """
+    """Replaces indices [B, F] of the concatenated episodes' frames with stacks."""
     chex.assert_rank(frames, {3, 5})
     flat = jnp.asarray(frames).reshape(-1, *frames.shape[2:])
     return expert.map_observations(functools.partial(gather_stacks, flat))
@@ -51,9 +46,6 @@ def make_gathering_step(step: Step) -> Step:
 
     (state, batch, expert, frames) -> (state, metrics). With frames, batches hold
     indices instead of pixels, see `gather_batch` and `gather_expert`.
-
-    Args:
-      step: (state, batch, expert) -> (state, metrics).
     """
 
     def gathering_step(
@@ -76,12 +68,9 @@ def make_gathering_step(step: Step) -> Step:
 
 
 def make_repeated_step(step: Step) -> Step:
-    """Returns a step that makes n updates in one call.
+    """Returns a step of `make_gathering_step` that makes n updates in one call.
 
     Its batches have a leading axis of length n; its metrics are the last update's.
-
-    Args:
-      step: from `make_gathering_step`.
     """
 
     def repeated_step(

@@ -24,10 +24,6 @@ def make_sample_action(
     (encoder params, actor params, observations [E, H, W, C], key, num_steps [E]) ->
     actions [E, A], for E environments. The agent step `num_steps` sets the noise's
     standard deviation and, with the key, its draw. Only updates clip the noise.
-
-    Args:
-      networks: the agent's.
-      exploration_std: standard deviation by agent step.
     """
     mean_action = make_mean_action(networks)
 

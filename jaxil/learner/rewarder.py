@@ -1,7 +1,7 @@
 """The interface of an imitation method: a few pure functions."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import chex
 import jax
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxil.learner.state import LearnerParams
+from jaxil.maths import augmentation, stacking
 from jaxil.maths.types import (
     AnyEpisode,
     Batch,
@@ -19,7 +20,7 @@ from jaxil.maths.types import (
     Metrics,
     PaddedEpisode,
 )
-from jaxil.networks.agent import AgentNetworks
+from jaxil.networks.agent import AgentNetworks, critic_features
 
 RewarderState = Any  # a pytree, the method's own
 
@@ -41,6 +42,20 @@ class AgentSpec(NamedTuple):
     def feature_dim(self) -> int:
         """D, the width of the trunks."""
         return self.networks.actor.feature_dim
+
+    def stack_frames(self, frames: Data) -> Array:
+        """Returns the observations of an episode, given its frames."""
+        return stacking.stack_frames(frames, frame_stack=self.frame_stack)
+
+    def augment(self, observation: Data, key: Array) -> Array:
+        """Returns observations [B, ...] after the random shift."""
+        return augmentation.augment(observation, key, padding=self.shift_padding)
+
+    def critic_features(self, learner: LearnerParams, observation: Data) -> Array:
+        """Returns the critic trunk's features of observations: [B, ...] to [B, D]."""
+        return critic_features(
+            self.networks, learner.encoder, learner.critic, observation
+        )
 
 
 class AgentView(NamedTuple):
@@ -84,6 +99,15 @@ class Spec(NamedTuple):
     observation_shape: tuple[int, ...]
 
 
+Result = TypeVar("Result")
+OfEpisode = Callable[
+    [RewarderState, LearnerParams, AnyEpisode, ExpertEpisodes | None], Result
+]
+OfSamples = Callable[
+    [RewarderState, LearnerParams, AgentView, ExpertBatch | None, Array], Result
+]
+
+
 class Rewarder(NamedTuple):
     """An imitation method as pure functions, like optax's (init, update).
 
@@ -120,36 +144,18 @@ class Rewarder(NamedTuple):
       summary: state -> scalars worth logging after an episode.
     """
 
-    rewards: Callable[
-        [RewarderState, LearnerParams, AnyEpisode, ExpertEpisodes | None], Array
-    ]
+    rewards: OfEpisode[Array]
     init: Callable[[Array, Spec, LearnerParams], RewarderState] = lambda *_: ()
-    update: Callable[
-        [RewarderState, LearnerParams, AgentView, ExpertBatch | None, Array],
-        tuple[RewarderState, Metrics],
-    ] = lambda state, *_: (state, {})
-    observe: Callable[
-        [RewarderState, LearnerParams, AnyEpisode, ExpertEpisodes | None], RewarderState
-    ] = lambda state, *_: state
+    update: OfSamples[tuple[RewarderState, Metrics]] = lambda state, *_: (state, {})
+    observe: OfEpisode[RewarderState] = lambda state, *_: state
     expert_batch_size: int = 0
     matches_episodes: bool = False
     samples_successors: bool = False
     ignores_padding: bool = False
     relabel: Callable[[RewarderState, LearnerParams, Batch], Array] | None = None
     rewards_changed: Callable[[RewarderState], Array | bool] | None = None
-    actor_loss: (
-        Callable[
-            [RewarderState, LearnerParams, AgentView, ExpertBatch | None, Array], Array
-        ]
-        | None
-    ) = None
-    plan: (
-        Callable[
-            [RewarderState, LearnerParams, AnyEpisode, ExpertEpisodes],
-            tuple[Array, Array],
-        ]
-        | None
-    ) = None
+    actor_loss: OfSamples[Array] | None = None
+    plan: OfEpisode[tuple[Array, Array]] | None = None
     summary: Callable[[RewarderState], Metrics] = lambda state: {}
 
 

@@ -57,17 +57,17 @@ class Learner:
         """Adam, the same for each network."""
         return optax.adam(self.learning_rate)
 
+    def augment(self, observation: Data, key: Array) -> Array:
+        """Returns observations [B, ...] after the random shift."""
+        return augmentation.augment(observation, key, padding=self.shift_padding)
+
 
 def init_train_state(
     learner: Learner, key: Array, observation: Data, spec: Spec
 ) -> TrainState:
     """Returns the state before the first update.
 
-    Args:
-      learner: networks and hyperparameters.
-      key: becomes the state's base key.
-      observation: an example of one observation, without batch axis.
-      spec: sizes.
+    `key` becomes its base key; `observation` is an example, without batch axis.
     """
     networks = learner.networks
     # Larger than all update numbers, so no random number is used twice.
@@ -120,8 +120,8 @@ def make_update_step(learner: Learner) -> UpdateStep:
             reward = jnp.sum(batch.window.weight * rewards, axis=1)
             batch = batch._replace(reward=jax.lax.stop_gradient(reward))
         batch = batch._replace(
-            observation=_augment(learner, batch.observation, shift_key),
-            next_observation=_augment(learner, batch.next_observation, next_key),
+            observation=learner.augment(batch.observation, shift_key),
+            next_observation=learner.augment(batch.next_observation, next_key),
         )
 
         state, representation, features, critic_metrics = _update_critic(
@@ -163,7 +163,7 @@ def _with_successors(
     # A separate key, so that no other random number depends on successors. The method
     # splits `key` too, and `split(key)[n]` may be `fold_in(key, n)`.
     successor_key = jax.random.fold_in(key, _SUCCESSOR_KEY)
-    successor = _augment(learner, batch.successor, successor_key)
+    successor = learner.augment(batch.successor, successor_key)
     features = critic_features(
         learner.networks, before.encoder, before.critic, successor
     )
@@ -172,10 +172,6 @@ def _with_successors(
         successor_features=jax.lax.stop_gradient(features),
         unshifted_successor=batch.successor,
     )
-
-
-def _augment(learner: Learner, observation: Array, key: Array) -> Array:
-    return augmentation.augment(observation, key, padding=learner.shift_padding)
 
 
 def _update_critic(

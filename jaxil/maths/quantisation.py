@@ -23,7 +23,9 @@ def nearest_codes(latent: Array, codebook: Array) -> Array:
 
     Source: van den Oord et al. 2017, arXiv:1711.00937, eq. (1).
     """
-    _assert_parts(latent, codebook)
+    chex.assert_rank([latent, codebook], 3)
+    chex.assert_equal(latent.shape[1], codebook.shape[0])
+    chex.assert_equal_shape_suffix([latent, codebook], 1)
     products = jnp.einsum("bpl,pml->bpm", latent, codebook)
     lengths = jnp.sum(jnp.square(codebook), axis=-1)
     return jnp.argmin(lengths[None] - 2.0 * products, axis=-1)
@@ -86,17 +88,9 @@ def perplexity(indices: Array, *, num_codes: int) -> Array:
 
         mean_p exp(-sum_m f_pm log f_pm),   f_pm = share of code m among B indices
 
-    Args:
-      indices: shape [B, P].
-      num_codes: M.
+    of indices [B, P] and M = `num_codes`.
     """
     chex.assert_rank(indices, 2)
     share = jnp.mean(jax.nn.one_hot(indices, num_codes), axis=0)
     entropy = -jnp.sum(jax.scipy.special.xlogy(share, share), axis=-1)
     return jnp.mean(jnp.exp(entropy))
-
-
-def _assert_parts(latent: Array, codebook: Array) -> None:
-    chex.assert_rank([latent, codebook], 3)
-    chex.assert_equal(latent.shape[1], codebook.shape[0])
-    chex.assert_equal_shape_suffix([latent, codebook], 1)

@@ -25,26 +25,20 @@ def make_agent_networks(
     feature_dim: int,
     hidden_dim: int,
     observation: str,
-    channels: tuple[int, ...],
-    kernel_sizes: tuple[int, ...],
-    strides: tuple[int, ...],
-    contrast: float,
-    mean: Any,
     compute_dtype: str = "float32",
-    native: bool = False,
+    **of_pixels: Any,
 ) -> AgentNetworks:
     """Returns the networks of DrQ-v2.
 
     `observation` is "pixels" or "state". `compute_dtype` is "float32" or "bfloat16",
-    for the convolutions and the product after them. See `PixelEncoder` for the others.
+    for the convolutions and the product after them; `of_pixels` are fields of
+    `PixelEncoder`.
     """
     dtype = jnp.dtype(compute_dtype)
     if observation == "state":
         encoder = StateEncoder(hidden_dim)
     else:
-        encoder = PixelEncoder(
-            channels, kernel_sizes, strides, contrast, mean, dtype, native
-        )
+        encoder = PixelEncoder(dtype=dtype, **of_pixels)
     return AgentNetworks(
         encoder=encoder,
         actor=Actor(action_dim, feature_dim, hidden_dim, dtype),
