@@ -1,7 +1,8 @@
 """DAC on pixels, a baseline: a discriminator with a separate encoder, relabelling."""
 
+from typing import Any
+
 import chex
-import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
@@ -9,15 +10,7 @@ from jax import Array
 from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, AgentView, Rewarder, Spec
 from jaxil.learner.state import LearnerParams, ModuleState, init_module
-from jaxil.maths import stacking
-from jaxil.maths.types import (
-    AnyEpisode,
-    Batch,
-    ExpertBatch,
-    ExpertEpisodes,
-    Metrics,
-    Params,
-)
+from jaxil.maths.types import AnyEpisode, Batch, ExpertBatch, Metrics, Params
 from jaxil.networks.agent import apply
 from jaxil.networks.discriminator import PixelDiscriminator
 from jaxil.rewarders.discrimination import (
@@ -58,10 +51,8 @@ def make_rewarder(
 
     Args:
       agent: the discriminator's encoder has the architecture of its encoder.
-      hidden_dim: width of the discriminator.
-      learning_rate: of its Adam.
-      gradient_penalty: its weight.
-      batch_size: expert samples, and agent samples, in an update.
+      hidden_dim, learning_rate, gradient_penalty, batch_size: see
+        `methods.DISCRIMINATOR`.
 
     Source: Kostrikov et al. 2019, arXiv:1809.02925, on pixels as in Cohen et al. 2021,
     sec. 4.1.
@@ -78,8 +69,7 @@ def make_rewarder(
         observation, action = x
         return apply(smooth, params, unscaled(observation), action)
 
-    def init(key: Array, spec: Spec, learner: LearnerParams) -> ModuleState:
-        del learner
+    def init(key: Array, spec: Spec, *_: Any) -> ModuleState:
         observation = jnp.zeros((1, *spec.observation_shape))
         params = discriminator.init(key, observation, jnp.zeros((1, spec.action_dim)))
         return init_module(params, optimiser)
@@ -110,24 +100,19 @@ def make_rewarder(
         window = batch.window
         assert window is not None
         chex.assert_equal_shape_prefix([window.observation, window.action], 2)
-        observation, action = jax.tree.map(
-            lambda x: jnp.reshape(x, (-1, *x.shape[2:])),
-            (window.observation, window.action),
+        observation, action = (
+            jnp.reshape(x, (-1, *x.shape[2:]))
+            for x in (window.observation, window.action)
         )
         flat = logits(state.params, (observation, action))
         return flat.reshape(window.action.shape[:2])
 
     def rewards(
-        state: ModuleState,
-        learner: LearnerParams,
-        episode: AnyEpisode,
-        expert_episodes: ExpertEpisodes | None,
+        state: ModuleState, learner: LearnerParams, episode: AnyEpisode, *_: Any
     ) -> Array:
         # For the log only: the agent learns from `relabel`.
-        del learner, expert_episodes
-        observations = stacking.stack_frames(
-            episode.frames, frame_stack=agent.frame_stack
-        )
+        del learner
+        observations = agent.stack_frames(episode.frames)
         return logits(state.params, (observations[:-1], jnp.asarray(episode.actions)))
 
     return Rewarder(

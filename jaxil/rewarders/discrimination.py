@@ -1,7 +1,7 @@
 """Shared by adversarial methods: the discriminator's step, rewards of transitions."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -17,13 +17,12 @@ from jaxil.learner.state import (
     apply_gradients,
     init_module,
 )
-from jaxil.maths import augmentation, losses, stacking
+from jaxil.maths import losses
 from jaxil.maths.types import (
     AnyEpisode,
     Batch,
     Data,
     ExpertBatch,
-    ExpertEpisodes,
     Metrics,
     Params,
 )
@@ -118,46 +117,55 @@ def twice_differentiable(encoder: Any) -> Any:
     return encoder.clone(native=False, by_windows=True)
 
 
+class TransitionJudge(NamedTuple):
+    """A discriminator D of transitions; by default of observations x = o.
+
+    Attributes:
+      init: (key, spec) -> parameters of D.
+      logits: (parameters, (x_t, x_{t+1})) -> logits [M], or [M, P].
+      penalised: see `update_discriminator`.
+      inputs: (learner, observations [M, ...]) -> x [M, ...].
+      agent_inputs: (view) -> the agent's x_t and x_{t+1}, [B, ...].
+      reward: (state, logits) -> rewards [M]; the state has D's parameters.
+    """
+
+    init: Callable[[Array, Spec], Params]
+    logits: Logits
+    penalised: Logits | None = None
+    inputs: Callable[[LearnerParams, Array], Array] = lambda _, observation: observation
+    agent_inputs: Callable[[AgentView], tuple[Array | None, Array | None]] = (
+        lambda view: (view.observation, view.successor)
+    )
+    reward: Callable[[RewarderState, Array], Array] = lambda _, logits: logits
+
+
 def make_transition_rewarder(
     agent: AgentSpec,
+    judge: TransitionJudge,
     *,
-    init_params: Callable[[Array, Spec], Params],
-    inputs: Callable[[LearnerParams, Array], Array],
-    agent_inputs: Callable[[AgentView], tuple[Array | None, Array | None]],
-    logits: Logits,
-    reward: Callable[[RewarderState, Array], Array],
     learning_rate: float,
     gradient_penalty: float,
     batch_size: int,
     relabels: bool,
-    penalised: Logits | None = None,
 ) -> Rewarder:
     """Returns the rewarder of a discriminator of transitions.
 
-        r_t = reward(logits D(x_t, x_{t+1}))
+        r_t = judge.reward(logits D(x_t, x_{t+1}))
 
-    where x = inputs(o). D is trained on augmented observations, but rewards are of
-    observations without augmentation.
+    D is trained on augmented observations, but rewards are of observations without
+    augmentation.
 
     Args:
       agent: its frame stack and shift are used.
-      init_params: (key, spec) -> parameters of D.
-      inputs: (learner, observations [M, ...]) -> x [M, ...].
-      agent_inputs: (view) -> the agent's x_t and x_{t+1}, [B, ...].
-      logits: (parameters, (x_t, x_{t+1})) -> logits [M], or [M, P].
-      reward: (state, logits) -> rewards [M]; the state has D's parameters.
-      learning_rate: of D's Adam.
-      gradient_penalty: its weight.
-      batch_size: expert samples, and agent samples, in an update.
+      judge: D, and what it sees.
+      learning_rate, gradient_penalty, batch_size: see `methods.DISCRIMINATOR`.
       relabels: whether rewards are recomputed for every batch; otherwise they are
         stored.
-      penalised: see `update_discriminator`.
     """
     optimiser = optax.adam(learning_rate)
 
-    def init(key: Array, spec: Spec, learner: LearnerParams) -> ModuleState:
-        del learner
-        return init_module(init_params(key, spec), optimiser)
+    def init(key: Array, spec: Spec, *_: Any) -> ModuleState:
+        return init_module(judge.init(key, spec), optimiser)
 
     def update(
         state: ModuleState,
@@ -174,30 +182,26 @@ def make_transition_rewarder(
         pairs = zip((expert.observation, expert.successor), keys, strict=True)
         return update_discriminator(
             state,
-            logits,
+            judge.logits,
             tuple(
-                inputs(learner, augmentation.augment(o, k, padding=agent.shift_padding))
-                for o, k in pairs
+                judge.inputs(learner, agent.augment(observation, k))
+                for observation, k in pairs
             ),
-            jax.tree.map(lambda x: x[:batch_size], agent_inputs(view)),
+            jax.tree.map(lambda x: x[:batch_size], judge.agent_inputs(view)),
             penalty_key,
             penalty_weight=gradient_penalty,
             optimiser=optimiser,
-            penalised=penalised,
+            penalised=judge.penalised,
         )
 
+    def reward(state: ModuleState, pair: Pair) -> Array:
+        return judge.reward(state, judge.logits(state.params, pair))
+
     def rewards(
-        state: ModuleState,
-        learner: LearnerParams,
-        episode: AnyEpisode,
-        expert_episodes: ExpertEpisodes | None,
+        state: ModuleState, learner: LearnerParams, episode: AnyEpisode, *_: Any
     ) -> Array:
-        del expert_episodes
-        observations = stacking.stack_frames(
-            episode.frames, frame_stack=agent.frame_stack
-        )
-        x = inputs(learner, observations)
-        return reward(state, logits(state.params, (x[:-1], x[1:])))
+        x = judge.inputs(learner, agent.stack_frames(episode.frames))
+        return reward(state, (x[:-1], x[1:]))
 
     def relabel(state: ModuleState, learner: LearnerParams, batch: Batch) -> Array:
         window = batch.window
@@ -206,11 +210,10 @@ def make_transition_rewarder(
         moments = [window.observation, batch.next_observation[:, None]]
         moments = jnp.concatenate(moments, axis=1)  # [B, n + 1, ...]
         size = moments.shape[:2]
-        x = inputs(learner, moments.reshape(-1, *moments.shape[2:]))
+        x = judge.inputs(learner, moments.reshape(-1, *moments.shape[2:]))
         x = x.reshape(*size, *x.shape[1:])
-        pair = (y.reshape(-1, *y.shape[2:]) for y in (x[:, :-1], x[:, 1:]))
-        judged = reward(state, logits(state.params, tuple(pair)))
-        return judged.reshape(window.action.shape[:2])
+        now, after = (y.reshape(-1, *y.shape[2:]) for y in (x[:, :-1], x[:, 1:]))
+        return reward(state, (now, after)).reshape(window.action.shape[:2])
 
     return Rewarder(
         rewards,

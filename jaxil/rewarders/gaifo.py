@@ -1,5 +1,7 @@
 """GAIfO with DAC's learner: a discriminator of transitions with a separate encoder."""
 
+from typing import Any
+
 import jax.numpy as jnp
 from jax import Array
 
@@ -10,6 +12,7 @@ from jaxil.networks.agent import apply
 from jaxil.networks.discriminator import TransitionDiscriminator
 from jaxil.rewarders.discrimination import (
     Pair,
+    TransitionJudge,
     make_transition_rewarder,
     twice_differentiable,
     unscaled,
@@ -27,15 +30,7 @@ METHOD = methods.Method(
 )
 
 
-def make_rewarder(
-    agent: AgentSpec,
-    *,
-    hidden_dim: int,
-    learning_rate: float,
-    gradient_penalty: float,
-    batch_size: int,
-    relabels: bool,
-) -> Rewarder:
+def make_rewarder(agent: AgentSpec, *, hidden_dim: int, **training: Any) -> Rewarder:
     """Returns the rewarder of GAIfO, extended to pixels as DAC is.
 
         r_t = logit D(o_t, o_{t+1})
@@ -47,8 +42,7 @@ def make_rewarder(
     Args:
       agent: the discriminator's encoder has the architecture of its encoder.
       hidden_dim: width of the discriminator.
-      learning_rate, gradient_penalty, batch_size, relabels: see
-        `make_transition_rewarder`.
+      **training: see `make_transition_rewarder`.
 
     Source: Torabi et al. 2018, Generative Adversarial Imitation from Observation,
     arXiv:1807.06158; off policy as in Kostrikov et al. 2019, arXiv:1809.02925;
@@ -58,7 +52,7 @@ def make_rewarder(
     discriminator = TransitionDiscriminator(encoder, agent.feature_dim, hidden_dim)
     smooth = discriminator.clone(encoder=twice_differentiable(encoder))
 
-    def init_params(key: Array, spec: Spec) -> Params:
+    def init(key: Array, spec: Spec) -> Params:
         observation = jnp.zeros((1, *spec.observation_shape))
         return discriminator.init(key, observation, observation)
 
@@ -68,16 +62,5 @@ def make_rewarder(
     def penalised(params: Params, pair: Pair) -> Array:
         return apply(smooth, params, *map(unscaled, pair))
 
-    return make_transition_rewarder(
-        agent,
-        init_params=init_params,
-        inputs=lambda learner, observation: observation,
-        agent_inputs=lambda view: (view.observation, view.successor),
-        logits=logits,
-        reward=lambda state, logits: logits,
-        learning_rate=learning_rate,
-        gradient_penalty=gradient_penalty,
-        batch_size=batch_size,
-        relabels=relabels,
-        penalised=penalised,
-    )
+    judge = TransitionJudge(init, logits, penalised)
+    return make_transition_rewarder(agent, judge, **training)

@@ -1,15 +1,20 @@
 """LAIfO: rewards from a discriminator of transitions between the critic's features."""
 
+from typing import Any
+
 import jax.numpy as jnp
 from jax import Array
 
 from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, Rewarder, RewarderState, Spec
-from jaxil.learner.state import LearnerParams
 from jaxil.maths.types import Params
-from jaxil.networks.agent import apply, critic_features
+from jaxil.networks.agent import apply
 from jaxil.networks.discriminator import Discriminator
-from jaxil.rewarders.discrimination import Pair, make_transition_rewarder
+from jaxil.rewarders.discrimination import (
+    Pair,
+    TransitionJudge,
+    make_transition_rewarder,
+)
 
 METHOD = methods.Method(
     name="laifo",
@@ -41,14 +46,7 @@ METHOD = methods.Method(
 
 
 def make_rewarder(
-    agent: AgentSpec,
-    *,
-    hidden_dim: int,
-    learning_rate: float,
-    gradient_penalty: float,
-    batch_size: int,
-    reward: str,
-    relabels: bool,
+    agent: AgentSpec, *, hidden_dim: int, reward: str, **training: Any
 ) -> Rewarder:
     """Returns the rewarder of LAIfO.
 
@@ -59,9 +57,8 @@ def make_rewarder(
     Args:
       agent: only its encoder and the critic's trunk are used.
       hidden_dim: width of the discriminator.
-      learning_rate, gradient_penalty, batch_size, relabels: see
-        `make_transition_rewarder`.
       reward: "decision", the equation above, or "logit", the logit itself.
+      **training: see `make_transition_rewarder`.
 
     Source: Giammarino et al. 2024, Adversarial Imitation Learning from Visual
     Observations using Latent Information, arXiv:2309.17371, and its code,
@@ -72,30 +69,20 @@ def make_rewarder(
     """
     discriminator = Discriminator(hidden_dim)
 
-    def init_params(key: Array, spec: Spec) -> Params:
+    def init(key: Array, spec: Spec) -> Params:
         return discriminator.init(key, jnp.zeros((1, 2 * agent.feature_dim)))
-
-    def inputs(learner: LearnerParams, observation: Array) -> Array:
-        return critic_features(
-            agent.networks, learner.encoder, learner.critic, observation
-        )
 
     def logits(params: Params, pair: Pair) -> Array:
         return apply(discriminator, params, jnp.concatenate(pair, axis=-1))
 
-    def rewarded(state: RewarderState, logits: Array) -> Array:
-        del state
+    def rewarded(_: RewarderState, logits: Array) -> Array:
         return logits if reward == "logit" else (logits > 0.0).astype(logits.dtype)
 
-    return make_transition_rewarder(
-        agent,
-        init_params=init_params,
-        inputs=inputs,
+    judge = TransitionJudge(
+        init,
+        logits,
+        inputs=agent.critic_features,
         agent_inputs=lambda view: (view.features, view.successor_features),
-        logits=logits,
         reward=rewarded,
-        learning_rate=learning_rate,
-        gradient_penalty=gradient_penalty,
-        batch_size=batch_size,
-        relabels=relabels,
     )
+    return make_transition_rewarder(agent, judge, **training)

@@ -1,5 +1,7 @@
 """PatchAIL: rewards from a discriminator of patches of pixels."""
 
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -8,12 +10,12 @@ from jax import Array
 from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, AgentView, Rewarder, Spec
 from jaxil.learner.state import LearnerParams, ModuleState
-from jaxil.maths import stacking
-from jaxil.maths.types import AnyEpisode, ExpertBatch, ExpertEpisodes, Metrics, Params
+from jaxil.maths.types import AnyEpisode, ExpertBatch, Metrics, Params
 from jaxil.networks.agent import apply
 from jaxil.networks.discriminator import PatchDiscriminator
 from jaxil.rewarders.discrimination import (
     Pair,
+    TransitionJudge,
     make_transition_rewarder,
     mean_logit,
     scaled,
@@ -71,14 +73,7 @@ class SimilarityState(ModuleState):
 
 
 def make_rewarder(
-    agent: AgentSpec,
-    *,
-    variant: str,
-    width: int,
-    learning_rate: float,
-    gradient_penalty: float,
-    batch_size: int,
-    relabels: bool,
+    agent: AgentSpec, *, variant: str, width: int, **training: Any
 ) -> Rewarder:
     """Returns the rewarder of PatchAIL, PatchAIL-W or PatchAIL-B.
 
@@ -94,8 +89,7 @@ def make_rewarder(
       agent: its frame stack and shift are used.
       variant: "plain", "weighted" or "bonus".
       width: see `PatchDiscriminator`.
-      learning_rate, gradient_penalty, batch_size, relabels: see
-        `make_transition_rewarder`.
+      **training: see `make_transition_rewarder`.
 
     Source: Liu et al. 2023, Visual Imitation Learning with Patch Rewards,
     arXiv:2302.00965, and its code, sail-sg/PatchAIL, where the first batch sets lambda,
@@ -114,29 +108,15 @@ def make_rewarder(
     def penalised(params: Params, pair: Pair) -> Array:
         return apply(smooth, params, jnp.concatenate(pair, axis=-1))
 
-    def similarity(state: SimilarityState, logits: Array) -> Array:
-        return patch_similarity(logits, state.expert_patches)
-
     def reward(state: SimilarityState, logits: Array) -> Array:
         mean = mean_logit(logits)
         if variant == "plain":
             return mean
-        s = state.scale * similarity(state, logits)
+        s = state.scale * patch_similarity(logits, state.expert_patches)
         return s * mean if variant == "weighted" else 0.5 * mean + s
 
-    plain = make_transition_rewarder(
-        agent,
-        init_params=init_params,
-        inputs=lambda learner, observation: observation,
-        agent_inputs=lambda view: (view.observation, view.successor),
-        logits=logits,
-        reward=reward,
-        learning_rate=learning_rate,
-        gradient_penalty=gradient_penalty,
-        batch_size=batch_size,
-        relabels=relabels,
-        penalised=penalised,
-    )
+    judge = TransitionJudge(init_params, logits, penalised, reward=reward)
+    plain = make_transition_rewarder(agent, judge, **training)
     if variant == "plain":
         return plain
 
@@ -162,23 +142,18 @@ def make_rewarder(
         assert expert is not None
         pair = jnp.asarray(expert.observation), jnp.asarray(expert.successor)
         probabilities = jnp.mean(jax.nn.sigmoid(logits(new.params, pair)), axis=0)
-        return state.replace(
-            params=new.params,
-            opt_state=new.opt_state,
-            expert_patches=probabilities / jnp.sum(probabilities),
-        ), metrics
+        patches = probabilities / jnp.sum(probabilities)
+        return new.replace(expert_patches=patches), metrics
 
     def observe(
-        state: SimilarityState,
-        learner: LearnerParams,
-        episode: AnyEpisode,
-        expert_episodes: ExpertEpisodes | None,
+        state: SimilarityState, learner: LearnerParams, episode: AnyEpisode, *_: Any
     ) -> SimilarityState:
-        del learner, expert_episodes
+        del learner
 
         def first_scale() -> Array:
-            x = stacking.stack_frames(episode.frames, frame_stack=agent.frame_stack)
-            found = similarity(state, logits(state.params, (x[:-1], x[1:])))
+            x = agent.stack_frames(episode.frames)
+            of_patches = logits(state.params, (x[:-1], x[1:]))
+            found = patch_similarity(of_patches, state.expert_patches)
             own = jnp.arange(len(found)) < episode.num_steps
             mean = jnp.sum(jnp.where(own, found, 0.0)) / episode.num_steps
             return _FIRST_SIMILARITY[variant] / mean

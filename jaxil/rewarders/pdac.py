@@ -1,6 +1,7 @@
 """P-DAC: rewards from a discriminator on the critic's features, or a code of pixels."""
 
 import functools
+from typing import Any
 
 import chex
 import jax
@@ -10,10 +11,9 @@ from jax import Array
 
 from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, AgentView, Rewarder, Spec
-from jaxil.learner.state import LearnerParams, ModuleState, init_module
-from jaxil.maths import augmentation, stacking
-from jaxil.maths.types import AnyEpisode, ExpertBatch, ExpertEpisodes, Metrics, Params
-from jaxil.networks.agent import apply, critic_features
+from jaxil.learner.state import LearnerParams, ModuleState
+from jaxil.maths.types import AnyEpisode, ExpertBatch, ExpertEpisodes, Metrics
+from jaxil.networks.agent import apply
 from jaxil.networks.discriminator import Discriminator
 from jaxil.networks.encoder import PixelEncoder
 from jaxil.rewarders import codes
@@ -67,10 +67,8 @@ def make_rewarder(
 
     Args:
       agent: its encoder, critic's trunk, frame stack and shift are used.
-      hidden_dim: width of the discriminator.
-      learning_rate: of its Adam.
-      gradient_penalty: its weight.
-      batch_size: expert samples, and agent samples, in an update.
+      hidden_dim, learning_rate, gradient_penalty, batch_size: see
+        `methods.DISCRIMINATOR`.
       sees_actions: whether actions are appended to the features: D(x_t, a_t).
       num_components: of each frame; 0, the paper's: the critic's features, as always
         for state vectors, which have no code.
@@ -79,6 +77,7 @@ def make_rewarder(
     out, from siddhanthaldar/ROT. The code of pixels is this project's own.
     """
     discriminator = Discriminator(hidden_dim)
+    logits = functools.partial(apply, discriminator)
     optimiser = optax.adam(learning_rate)
     if not isinstance(agent.networks.encoder, PixelEncoder):
         num_components = 0
@@ -89,11 +88,7 @@ def make_rewarder(
             return features
         return jnp.concatenate([features, action], axis=-1)
 
-    def logits(params: Params, x: Array) -> Array:
-        return apply(discriminator, params, x)
-
-    def init(key: Array, spec: Spec, learner: LearnerParams) -> JudgeState:
-        del learner
+    def init(key: Array, spec: Spec, *_: Any) -> JudgeState:
         code, width = None, agent.feature_dim
         if num_components:
             code = codes.init_code(
@@ -104,8 +99,7 @@ def make_rewarder(
             width = num_components * agent.frame_stack
         width += spec.action_dim if sees_actions else 0
         params = discriminator.init(key, jnp.zeros((1, width)))
-        module = init_module(params, optimiser)
-        return JudgeState(module.params, module.opt_state, code)
+        return JudgeState(params, optimiser.init(params), code)
 
     def observe(
         state: JudgeState,
@@ -131,12 +125,8 @@ def make_rewarder(
         shift_key, penalty_key = jax.random.split(key)
         code = state.code
         if code is None:
-            observation = augmentation.augment(
-                expert.observation, shift_key, padding=agent.shift_padding
-            )
-            expert_features = critic_features(
-                agent.networks, learner.encoder, learner.critic, observation
-            )
+            observation = agent.augment(expert.observation, shift_key)
+            expert_features = agent.critic_features(learner, observation)
             features = view.features[:batch_size]
         else:
             # Not augmented: a shift would change the code, which is all that D sees.
@@ -159,18 +149,11 @@ def make_rewarder(
             return codes.encode_episode(
                 state.code, frames, frame_stack=agent.frame_stack
             )
-        observations = stacking.stack_frames(frames, frame_stack=agent.frame_stack)
-        return critic_features(
-            agent.networks, learner.encoder, learner.critic, observations
-        )
+        return agent.critic_features(learner, agent.stack_frames(frames))
 
     def rewards(
-        state: JudgeState,
-        learner: LearnerParams,
-        episode: AnyEpisode,
-        expert_episodes: ExpertEpisodes | None,
+        state: JudgeState, learner: LearnerParams, episode: AnyEpisode, *_: Any
     ) -> Array:
-        del expert_episodes
         features = features_of(state, learner, episode.frames)
         # r(o_{t+1}), as in the reference; with actions the pair is (o_t, a_t).
         judged = features[:-1] if sees_actions else features[1:]
