@@ -1,5 +1,6 @@
 """Rewarders that compare a whole episode with the demonstrations."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -25,9 +26,9 @@ def make_comparing_rewarder(
     update_features: Callable[[Any, LearnerParams, AnyEpisode, ExpertEpisodes], Any],
     embed: Callable[[Any, Array], Array],
     compare: Compare,
-    plan: Compare | None,
-    return_scale: float | None,
-    rewards_changed: Callable[[Any], Any] | None,
+    plan: Compare | None = None,
+    return_scale: float | None = None,
+    rewards_changed: Callable[[Any], Any] | None = None,
 ) -> Rewarder:
     """Returns a rewarder of whole episodes under some features.
 
@@ -47,16 +48,13 @@ def make_comparing_rewarder(
       rewards_changed: see `Rewarder`.
     """
 
-    def compare_with(
-        function: Compare,
-        state: Any,
-        episode: AnyEpisode,
-        expert_episodes: ExpertEpisodes | None,
-    ) -> Any:
+    def compared(
+        state: Any, episode: AnyEpisode, expert_episodes: ExpertEpisodes | None
+    ) -> tuple[Array, Array, Array, Array]:
+        """Returns what `compare` and `plan` take."""
         assert expert_episodes is not None
-        features = embed(state, jnp.asarray(episode.frames))
-        return function(
-            features,
+        return (
+            embed(state, jnp.asarray(episode.frames)),
             jnp.asarray(episode.num_steps) + 1,
             state.expert_features,
             jnp.asarray(expert_episodes.num_frames),
@@ -66,7 +64,7 @@ def make_comparing_rewarder(
         state: Any, episode: AnyEpisode, expert_episodes: ExpertEpisodes | None
     ) -> Array:
         # Reward t is that of o_{t+1}.
-        return compare_with(compare, state, episode, expert_episodes)[1:]
+        return compare(*compared(state, episode, expert_episodes))[1:]
 
     def observe(
         state: Any,
@@ -88,24 +86,14 @@ def make_comparing_rewarder(
         )
         return state.replace(scale=scale)
 
-    def rewards(
-        state: Any,
-        learner: LearnerParams,
-        episode: AnyEpisode,
-        expert_episodes: ExpertEpisodes | None,
-    ) -> Array:
+    def rewards(state: Any, learner: LearnerParams, *episodes: Any) -> Array:
         del learner
-        return state.scale * unscaled(state, episode, expert_episodes)
+        return state.scale * unscaled(state, *episodes)
 
-    def plan_of(
-        state: Any,
-        learner: LearnerParams,
-        episode: AnyEpisode,
-        expert_episodes: ExpertEpisodes,
-    ) -> tuple[Array, Array]:
+    def plan_of(state: Any, learner: LearnerParams, *episodes: Any) -> Any:
         del learner
         assert plan is not None
-        return compare_with(plan, state, episode, expert_episodes)
+        return plan(*compared(state, *episodes))
 
     return Rewarder(
         rewards,
@@ -119,3 +107,14 @@ def make_comparing_rewarder(
             {} if return_scale is None else {"sinkhorn/scale": state.scale}
         ),
     )
+
+
+def embed_demonstrations(
+    embed: Callable[[Any, Array], Array], state: Any, expert_episodes: ExpertEpisodes
+) -> Any:
+    """Returns the state with the demonstrations' features, as `embed` sees them now."""
+    # One demonstration at a time: all at once would need gigabytes.
+    features = jax.lax.map(
+        functools.partial(embed, state), jnp.asarray(expert_episodes.frames)
+    )
+    return state.replace(expert_features=features)

@@ -28,16 +28,9 @@ class Matching(NamedTuple):
     def rewards(
         self, agent: Array, agent_moments: Array, experts: Array, expert_moments: Array
     ) -> Array:
-        """Returns rewards towards the demonstration that is cheapest to reach.
+        """Returns rewards towards the demonstration that is cheapest to reach, [T].
 
-        Args:
-          agent: features of an episode. Shape [T, D].
-          agent_moments: how many of its T are not padding. Shape [].
-          experts: features of the demonstrations. Shape [K, N, D].
-          expert_moments: how many of a demonstration's N are not padding. Shape [K].
-
-        Returns:
-          Rewards of the agent's observations, see `closest`; 0 for padding. Shape [T].
+        See `comparison.Compare` for the shapes, and `closest`.
         """
         pairs = self._costs_and_plans(agent, agent_moments, experts, expert_moments)
         return closest(*pairs)[0]
@@ -53,7 +46,7 @@ class Matching(NamedTuple):
     def _costs_and_plans(
         self, agent: Array, agent_moments: Array, experts: Array, expert_moments: Array
     ) -> tuple[Array, Array]:
-        compared = [agent, agent_moments, experts, expert_moments]
+        compared = agent, agent_moments, experts, expert_moments
         chex.assert_rank(compared, [2, 0, 3, 1])
         chex.assert_equal_shape_prefix([experts, expert_moments], 1)
         agent_mass = transport.uniform_mass(agent_moments, len(agent))
@@ -75,12 +68,8 @@ def closest(costs: Array, plans: Array) -> tuple[Array, Array, Array]:
     without the entropy, as here. At epsilon 0.01 the two differ only in near ties: in 1
     of 40 draws of near-identical demonstrations.
 
-    Args:
-      costs: one matrix for each demonstration. Shape [K, T, N].
-      plans: one for each demonstration. Shape [K, T, N].
-
-    Returns:
-      Rewards of the agent's T observations [T], the plan behind them [T, N] and k* [].
+    Maps one cost matrix and one plan for each demonstration, [K, T, N], to rewards of
+    the agent's observations [T], the plan behind them [T, N] and k* [].
 
     Source: Cohen et al. 2021, eq. (5); siddhanthaldar/ROT, agent/potil.py.
     """
@@ -103,14 +92,10 @@ def make_matching(
 
     Source: Cohen et al. 2021, sec. 3.1, and fig. 7 for what is not P-SIL's own.
     """
-
     sinkhorn = functools.partial(
         transport.sinkhorn_plan, epsilon=epsilon, num_iterations=num_iterations
     )
-    costs = {
-        "cosine": transport.cosine_cost,
-        "euclidean": transport.euclidean_cost,
-    }
+    costs = {"cosine": transport.cosine_cost, "euclidean": transport.euclidean_cost}
     plans = {"transport": sinkhorn, "time": transport.simultaneous_plan}
     return Matching(
         lambda agent, expert, *moments: costs[cost](agent, expert), plans[alignment]

@@ -48,10 +48,9 @@ def make_rewarder(
     scaled.
 
     Args:
-      agent: its encoder, actor's trunk and frame stack are used.
+      agent, target_update_steps: see `make_target_rewarder`.
       temperature: see `coverage_rewards`.
       num_waypoints: frames of a demonstration that have to be covered.
-      target_update_steps: agent steps between target copies.
 
     Source: Huey et al. 2025, Imitation Learning from a Single Temporally Misaligned
     Video; portal-cornell/orca. The paper has one demonstration, and all its frames
@@ -73,11 +72,7 @@ def make_rewarder(
         return candidates[jnp.argmax(jnp.sum(candidates, axis=1))]
 
     return make_target_rewarder(
-        agent,
-        compare=compare,
-        plan=None,
-        target_update_steps=target_update_steps,
-        return_scale=None,
+        agent, compare=compare, target_update_steps=target_update_steps
     )
 
 

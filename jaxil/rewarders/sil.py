@@ -1,5 +1,7 @@
 """SIL on pixels, a baseline: transport in an adversarially trained embedding."""
 
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -16,11 +18,11 @@ from jaxil.learner.state import (
     copy_params,
     init_module,
 )
-from jaxil.maths import stacking, transport
+from jaxil.maths import transport
 from jaxil.maths.types import AnyEpisode, ExpertBatch, ExpertEpisodes, Metrics, Params
 from jaxil.networks.agent import apply
 from jaxil.networks.discriminator import Embedding
-from jaxil.rewarders.comparison import make_comparing_rewarder
+from jaxil.rewarders.comparison import embed_demonstrations, make_comparing_rewarder
 from jaxil.rewarders.matching import Matching, make_matching
 
 METHOD = methods.Method(
@@ -60,13 +62,11 @@ class SilState(struct.PyTreeNode):
 def make_rewarder(
     agent: AgentSpec,
     *,
-    cost: str,
     alignment: str,
-    epsilon: float,
-    num_iterations: int,
     return_scale: float,
     learning_rate: float,
     batch_size: int,
+    **of_matching: Any,
 ) -> Rewarder:
     """Returns the rewarder of SIL, extended to pixels.
 
@@ -79,36 +79,26 @@ def make_rewarder(
 
     Args:
       agent: the embedding's encoder has the architecture of its encoder.
-      cost, alignment, epsilon, num_iterations: see `make_matching`. The alignment is
-        that of the rewards; f always learns from transport.
-      return_scale: the first episode returns minus this.
-      learning_rate: of the embedding's Adam.
-      batch_size: expert samples, and agent samples, in an update.
+      alignment: of the rewards; f always learns from transport.
+      return_scale, learning_rate, batch_size: see the fields above.
+      **of_matching: see `make_matching`.
 
     Source: Papagiannis and Li 2020, arXiv:2008.09167, sec. 3, on pixels as in Cohen
     et al. 2021, sec. 4.1. The original differs in more than pixels: it embeds whole
     episodes, on policy, into 10 linear outputs, at a learning rate of 5e-4. Here the
     learner is off policy, and each update trains f for one step on batches.
     """
-    matching = make_matching(
-        cost=cost, alignment=alignment, epsilon=epsilon, num_iterations=num_iterations
-    )
+    matching = make_matching(alignment=alignment, **of_matching)
     # A batch has no order in time.
-    unordered = make_matching(
-        cost=cost,
-        alignment="transport",
-        epsilon=epsilon,
-        num_iterations=num_iterations,
-    )
+    unordered = make_matching(alignment="transport", **of_matching)
     embedding = Embedding(agent.networks.encoder, agent.feature_dim)
     optimiser = optax.adam(learning_rate)
 
-    def embed(params: Params, frames: Array) -> Array:
-        observations = stacking.stack_frames(frames, frame_stack=agent.frame_stack)
-        return apply(embedding, params, observations)
+    def embed(state: SilState, frames: Array) -> Array:
+        observations = agent.stack_frames(frames)
+        return apply(embedding, state.compared, observations)
 
-    def init(key: Array, spec: Spec, learner: LearnerParams) -> SilState:
-        del learner
+    def init(key: Array, spec: Spec, *_: Any) -> SilState:
         params = embedding.init(key, jnp.zeros((1, *spec.observation_shape)))
         shape = (spec.num_demonstrations, spec.expert_steps + 1, agent.feature_dim)
         return SilState(
@@ -147,15 +137,13 @@ def make_rewarder(
         expert_episodes: ExpertEpisodes,
     ) -> SilState:
         del learner, episode
-        params = copy_params(state.embedding.params)
-        # One demonstration at a time: all at once would need gigabytes.
-        features = jax.lax.map(lambda f: embed(params, f), expert_episodes.frames)
-        return state.replace(compared=params, expert_features=features)
+        state = state.replace(compared=copy_params(state.embedding.params))
+        return embed_demonstrations(embed, state, expert_episodes)
 
     rewarder = make_comparing_rewarder(
         init=init,
         update_features=update_features,
-        embed=lambda state, frames: embed(state.compared, frames),
+        embed=embed,
         compare=matching.rewards,
         plan=matching.closest_plan,
         return_scale=return_scale,
@@ -165,17 +153,12 @@ def make_rewarder(
 
 
 def batch_distance(matching: Matching, agent: Array, expert: Array) -> Array:
-    """Returns the transport cost between two batches of features, to be maximised.
+    """Returns the transport cost between features of two batches, [B, D], to maximise.
 
         <C, P>   with the gradient   sum_tn P_tn dC_tn
 
     The plan has no gradient: by Danskin's theorem the one above is that of the entropic
     distance at the optimal plan, so Sinkhorn's iterations are not differentiated.
-
-    Args:
-      matching: cost and plan.
-      agent: shape [B, D].
-      expert: shape [B, D].
     """
     chex.assert_rank([agent, expert], 2)
     sizes = [jnp.asarray(len(batch)) for batch in (agent, expert)]

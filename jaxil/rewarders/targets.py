@@ -7,10 +7,13 @@ from jax import Array
 
 from jaxil.learner.rewarder import AgentSpec, Rewarder, Spec
 from jaxil.learner.state import LearnerParams, copy_params
-from jaxil.maths import stacking
 from jaxil.maths.types import AnyEpisode, ExpertEpisodes, Params
 from jaxil.networks.agent import actor_features
-from jaxil.rewarders.comparison import Compare, make_comparing_rewarder
+from jaxil.rewarders.comparison import (
+    Compare,
+    embed_demonstrations,
+    make_comparing_rewarder,
+)
 
 
 class TargetState(struct.PyTreeNode):
@@ -36,9 +39,9 @@ def make_target_rewarder(
     agent: AgentSpec,
     *,
     compare: Compare,
-    plan: Compare | None,
     target_update_steps: int,
-    return_scale: float | None,
+    plan: Compare | None = None,
+    return_scale: float | None = None,
 ) -> Rewarder:
     """Returns a rewarder of whole episodes under slowly changing features.
 
@@ -48,15 +51,17 @@ def make_target_rewarder(
 
     Args:
       agent: its encoder, actor's trunk and frame stack are used.
-      compare: see `make_comparing_rewarder`, as `plan` and `return_scale`.
-      plan: the transport plan behind the rewards; None without one.
+      compare, plan, return_scale: see `make_comparing_rewarder`.
       target_update_steps: agent steps between copies.
-      return_scale: minus the first episode's return; None: rewards are not scaled.
     """
 
-    def embed(encoder: Params, actor: Params, frames: Array) -> Array:
-        observations = stacking.stack_frames(frames, frame_stack=agent.frame_stack)
-        return actor_features(agent.networks, encoder, actor, observations)
+    def embed(state: TargetState, frames: Array) -> Array:
+        return actor_features(
+            agent.networks,
+            state.target_encoder,
+            state.target_actor,
+            agent.stack_frames(frames),
+        )
 
     def init(key: Array, spec: Spec, learner: LearnerParams) -> TargetState:
         del key
@@ -73,18 +78,12 @@ def make_target_rewarder(
     def copy_targets(
         state: TargetState, learner: LearnerParams, expert_episodes: ExpertEpisodes
     ) -> TargetState:
-        # One demonstration at a time: all at once would need gigabytes.
-        expert_features = jax.lax.map(
-            lambda frames: embed(learner.encoder, learner.actor, frames),
-            expert_episodes.frames,
-        )
-        return TargetState(
+        state = state.replace(
             target_encoder=learner.encoder,
             target_actor=learner.actor,
-            expert_features=expert_features,
-            scale=state.scale,
             steps_since_copy=jnp.zeros((), jnp.int32),
         )
+        return embed_demonstrations(embed, state, expert_episodes)
 
     def update_features(
         state: TargetState,
@@ -104,9 +103,7 @@ def make_target_rewarder(
     return make_comparing_rewarder(
         init=init,
         update_features=update_features,
-        embed=lambda state, frames: embed(
-            state.target_encoder, state.target_actor, frames
-        ),
+        embed=embed,
         compare=compare,
         plan=plan,
         return_scale=return_scale,

@@ -146,14 +146,10 @@ def band_plan(
 
     Args:
       cost: pairwise costs, of the size of cosine costs. Shape [T, N].
-      agent_mass: see `transport.sinkhorn_plan`. Shape [T].
-      expert_mass: likewise. Shape [N].
+      agent_mass, expert_mass, num_iterations: see `transport.sinkhorn_plan`, which
+        makes the plan.
       band_steps: half the band's width.
       epsilon: weight of the entropy, in units of cost; at most 1.
-      num_iterations: Sinkhorn iterations; static under jit.
-
-    Returns:
-      A plan as `transport.sinkhorn_plan` returns it. Shape [T, N].
 
     Source: Fu et al. 2024, the temporal mask; fuyw/TemporalOT.
     """
