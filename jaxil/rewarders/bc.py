@@ -4,6 +4,8 @@ The agent never acts in the environment; each update counts as the frames that o
 methods play per update.
 """
 
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -13,7 +15,7 @@ from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, Rewarder
 from jaxil.learner.state import TrainState, apply_gradients
 from jaxil.learner.update import Learner, UpdateStep
-from jaxil.maths import augmentation, losses
+from jaxil.maths import losses
 from jaxil.maths.types import Batch, ExpertBatch, Metrics, Params
 from jaxil.networks.agent import apply
 from jaxil.rewarders.zero import zero_rewards
@@ -32,21 +34,17 @@ METHOD = methods.Method(
 )
 
 
-def make_rewarder(agent: AgentSpec, *, batch_size: int, std: float) -> Rewarder:
+def make_rewarder(agent: AgentSpec, *, batch_size: int, **_: Any) -> Rewarder:
     """Returns a rewarder of zeros, which asks for expert samples."""
-    del agent, std
+    del agent
     return Rewarder(zero_rewards, expert_batch_size=batch_size)
 
 
 def make_update_step(learner: Learner, *, batch_size: int, std: float) -> UpdateStep:
     """Returns the step that trains encoder and actor on the expert's actions.
 
-    Critic and rewarder are not trained; the agent's batch is None.
-
-    Args:
-      learner: networks and hyperparameters.
-      batch_size: expert samples.
-      std: see `losses.cloning_loss`.
+    Critic and rewarder are not trained; the agent's batch is None. An update has
+    `batch_size` expert samples; for `std` see `losses.cloning_loss`.
 
     Source: Cohen et al. 2021, sec. 4.1, the BC baseline; siddhanthaldar/ROT,
     agent/bc.py.
@@ -59,12 +57,8 @@ def make_update_step(learner: Learner, *, batch_size: int, std: float) -> Update
         assert expert is not None
         chex.assert_rank(expert.action, 2)
         chex.assert_axis_dimension(expert.action, 0, batch_size)
-        observation = augmentation.augment(
-            expert.observation,
-            jax.random.fold_in(state.key, state.num_updates),
-            padding=learner.shift_padding,
-        )
-        return clone(learner, state, observation, expert.action, std=std)
+        key = jax.random.fold_in(state.key, state.num_updates)
+        return clone(learner, state, expert, expert.action, key, std=std)
 
     return cloning_step
 
@@ -72,21 +66,24 @@ def make_update_step(learner: Learner, *, batch_size: int, std: float) -> Update
 def clone(
     learner: Learner,
     state: TrainState,
-    observation: Array,
+    expert: ExpertBatch,
     action: Array,
+    key: Array,
     *,
     std: float,
 ) -> tuple[TrainState, Metrics]:
-    """Trains encoder and actor for one step to answer `observation` with `action`.
+    """Trains encoder and actor for one step to answer the expert's observations.
 
     Args:
       learner: networks and hyperparameters.
       state: its critic and rewarder are not trained.
-      observation: augmented. Shape [B, H, W, C] or [B, S].
-      action: shape [B, A].
+      expert: its observations are augmented here; its actions are not read.
+      action: the answers. Shape [B, A].
+      key: of the augmentation; consumed.
       std: see `losses.cloning_loss`.
     """
     encoder, actor, _ = learner.networks
+    observation = learner.augment(expert.observation, key)
 
     def loss(params: tuple[Params, Params]) -> tuple[Array, Array]:
         representation = apply(encoder, params[0], observation)

@@ -5,6 +5,8 @@ observation to the next, labels the demonstrations with it, and the policy clone
 labels. There is neither a reward nor a critic.
 """
 
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -14,7 +16,6 @@ from jax import Array
 from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, Rewarder, Spec
 from jaxil.learner.state import (
-    LearnerParams,
     ModuleState,
     TrainState,
     apply_gradients,
@@ -50,24 +51,17 @@ def make_rewarder(
     agent: AgentSpec,
     *,
     batch_size: int,
-    std: float,
     hidden_dim: int,
     learning_rate: float,
+    **_: Any,
 ) -> Rewarder:
     """Returns a rewarder of zeros, whose state is the inverse model.
 
-    Args:
-      agent: the inverse model has an encoder like the agent's.
-      batch_size: expert samples.
-      std: not used here.
-      hidden_dim: width of the inverse model.
-      learning_rate: of the inverse model's Adam.
+    For the arguments see `make_update_step`.
     """
-    del std
     model = _inverse_model(agent.networks, hidden_dim)
 
-    def init(key: Array, spec: Spec, learner: LearnerParams) -> ModuleState:
-        del learner
+    def init(key: Array, spec: Spec, *_: Any) -> ModuleState:
         observation = jnp.zeros((1, *spec.observation_shape))
         params = model.init(key, observation, observation)
         return init_module(params, optax.adam(learning_rate))
@@ -99,7 +93,7 @@ def make_update_step(
     diverse the play is depends on the run's exploration.
 
     Args:
-      learner: networks and hyperparameters.
+      learner: the inverse model has an encoder like its networks'.
       batch_size: expert samples; those of the agent are `config.batch_size`.
       std: see `losses.cloning_loss`.
       hidden_dim: width of the inverse model.
@@ -122,9 +116,8 @@ def make_update_step(
         chex.assert_axis_dimension(expert.observation, 0, batch_size)
         step_key = jax.random.fold_in(state.key, state.num_updates)
         pair_key, expert_key = jax.random.split(step_key)
-        padding = learner.shift_padding
         pair = augmentation.augment_pair(
-            batch.observation, batch.successor, pair_key, padding=padding
+            batch.observation, batch.successor, pair_key, padding=learner.shift_padding
         )
 
         def loss(params: Params) -> Array:
@@ -135,13 +128,8 @@ def make_update_step(
         error, gradients = jax.value_and_grad(loss)(state.rewarder.params)
         inverse = apply_gradients(state.rewarder, gradients, optimiser)
         labels = apply(model, inverse.params, expert.observation, expert.successor)
-        state, metrics = bc.clone(
-            learner,
-            state.replace(rewarder=inverse),
-            augmentation.augment(expert.observation, expert_key, padding=padding),
-            labels,
-            std=std,
-        )
+        state = state.replace(rewarder=inverse)
+        state, metrics = bc.clone(learner, state, expert, labels, expert_key, std=std)
         return state, {**metrics, "inverse_model/error": error}
 
     return bco_step

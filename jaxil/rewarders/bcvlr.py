@@ -5,6 +5,9 @@ agent's own experience shows which action each stands for, and the policy clones
 There is neither a reward nor a critic.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -15,7 +18,6 @@ from jax import Array
 from jaxil import methods
 from jaxil.learner.rewarder import AgentSpec, Rewarder, Spec
 from jaxil.learner.state import (
-    LearnerParams,
     ModuleState,
     TrainState,
     apply_gradients,
@@ -91,6 +93,8 @@ METHOD = methods.Method(
     ),
 )
 
+_SIZES = ("num_parts", "num_codes", "part_dim", "hidden_dim")  # of its model
+
 
 class LatentState(struct.PyTreeNode):
     """What the method learns.
@@ -108,32 +112,16 @@ def make_rewarder(
     agent: AgentSpec,
     *,
     batch_size: int,
-    std: float,
-    num_parts: int,
-    num_codes: int,
-    part_dim: int,
-    hidden_dim: int,
     learning_rate: float,
-    commitment: float,
-    prediction_weight: float,
-    target_tau: float,
+    **fields: Any,
 ) -> Rewarder:
     """Returns a rewarder of zeros, whose state is the latent-action model.
 
-    Args:
-      agent: the model has an encoder like the agent's.
-      batch_size: expert samples.
-      std, commitment, prediction_weight, target_tau: not used here.
-      num_parts, num_codes, part_dim, hidden_dim: see `LatentActionModel`.
-      learning_rate: of its Adam.
+    For the arguments see `make_update_step`.
     """
-    del std, commitment, prediction_weight, target_tau
-    embedding, model = _modules(
-        agent.networks, num_parts, num_codes, part_dim, hidden_dim
-    )
+    embedding, model = _modules(agent.networks, fields)
 
-    def init(key: Array, spec: Spec, learner: LearnerParams) -> LatentState:
-        del learner
+    def init(key: Array, spec: Spec, *_: Any) -> LatentState:
         keys = jax.random.split(key)
         observation = jnp.zeros((1, *spec.observation_shape))
         embed = embedding.init(keys[0], observation)
@@ -156,14 +144,11 @@ def make_update_step(
     *,
     batch_size: int,
     std: float,
-    num_parts: int,
-    num_codes: int,
-    part_dim: int,
-    hidden_dim: int,
     learning_rate: float,
     commitment: float,
     prediction_weight: float,
     target_tau: float,
+    **sizes: int,
 ) -> UpdateStep:
     """Returns the step that trains all parts at once; the critic is not used.
 
@@ -199,18 +184,17 @@ def make_update_step(
       learner: networks and hyperparameters.
       batch_size: expert samples; those of the agent are `config.batch_size`.
       std: see `losses.cloning_loss`.
-      num_parts, num_codes, part_dim, hidden_dim: see `LatentActionModel`.
       learning_rate: of the Adam of all that is not the agent's.
       commitment: beta.
       prediction_weight: w.
       target_tau: h' <- h' + tau (h - h') after each step.
+      **sizes: `num_parts`, `num_codes`, `part_dim` and `hidden_dim` of
+        `LatentActionModel`.
 
     Source: Liu et al. 2025, arXiv:2512.21586; liuxin0824/BCV-LR, run_offline.py and
     run_online.py.
     """
-    embedding, model = _modules(
-        learner.networks, num_parts, num_codes, part_dim, hidden_dim
-    )
+    embedding, model = _modules(learner.networks, sizes)
     optimiser = optax.adam(learning_rate)
 
     def infer(
@@ -233,10 +217,11 @@ def make_update_step(
         distance = quantisation.codebook_loss(latent, code)
         committed = quantisation.commitment_loss(latent, code)
         action = apply(model, params[1], latent, method=model.decode)
+        used = quantisation.perplexity(indices, num_codes=model.num_codes)
         metrics = {
             "latent/prediction": error,
             "latent/distance": distance,
-            "latent/codes_used": quantisation.perplexity(indices, num_codes=num_codes),
+            "latent/codes_used": used,
         }
         return error + distance + commitment * committed, action, metrics
 
@@ -284,12 +269,9 @@ def make_update_step(
         slow = optax.incremental_update(
             live.params[0], state.rewarder.target, target_tau
         )
+        state = state.replace(rewarder=LatentState(live, slow))
         state, cloning_metrics = bc.clone(
-            learner,
-            state.replace(rewarder=LatentState(live, slow)),
-            augmentation.augment(expert.observation, expert_key, padding=padding),
-            labels,
-            std=std,
+            learner, state, expert, labels, expert_key, std=std
         )
         return state, {**cloning_metrics, **metrics}
 
@@ -297,13 +279,12 @@ def make_update_step(
 
 
 def _modules(
-    networks: AgentNetworks,
-    num_parts: int,
-    num_codes: int,
-    part_dim: int,
-    hidden_dim: int,
+    networks: AgentNetworks, fields: Mapping[str, Any]
 ) -> tuple[Embedding, LatentActionModel]:
-    dim, action_dim = networks.actor.feature_dim, networks.actor.action_dim
-    return Embedding(networks.encoder, dim), LatentActionModel(
-        num_parts, num_codes, part_dim, hidden_dim, dim, action_dim
+    actor = networks.actor
+    model = LatentActionModel(
+        **{name: fields[name] for name in _SIZES},
+        feature_dim=actor.feature_dim,
+        action_dim=actor.action_dim,
     )
+    return Embedding(networks.encoder, actor.feature_dim), model

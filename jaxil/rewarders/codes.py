@@ -93,13 +93,7 @@ def encode(code: FrameCode, observation: Array, *, frame_stack: int) -> Array:
 def encode_episode(code: FrameCode, frames: Array, *, frame_stack: int) -> Array:
     """Returns `encode` of all observations of an episode, each frame encoded once.
 
-    Args:
-      code: fitted.
-      frames: shape [T + 1, H, W, 3].
-      frame_stack: F.
-
-    Returns:
-      Shape [T + 1, F * J].
+    Maps frames [T + 1, H, W, 3] to [T + 1, F * J].
     """
     codes = encode_frames(code, frames)
     codes = stacking.stack_frames(codes, frame_stack=frame_stack)

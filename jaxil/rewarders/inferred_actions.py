@@ -5,6 +5,7 @@ to the next, as in BCO, and infer the actions of the expert's video. The actor t
 follows rewards and, as far as those inferred actions are trusted, copies them.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import chex
@@ -14,6 +15,7 @@ import optax
 from flax import struct
 from jax import Array
 
+from jaxil import methods
 from jaxil.learner.rewarder import (
     AgentSpec,
     AgentView,
@@ -28,13 +30,7 @@ from jaxil.learner.state import (
     init_module,
 )
 from jaxil.maths import augmentation, cloning
-from jaxil.maths.types import (
-    AnyEpisode,
-    ExpertBatch,
-    ExpertEpisodes,
-    Metrics,
-    Params,
-)
+from jaxil.maths.types import ExpertBatch, Metrics, Params
 from jaxil.networks.agent import apply
 from jaxil.networks.inverse_model import InverseModels
 
@@ -53,6 +49,21 @@ class CloningState(struct.PyTreeNode):
 
     inner: RewarderState
     models: ModuleState
+
+
+def add_cloning(make_inner: Callable[..., Rewarder]) -> Callable[..., Rewarder]:
+    """Returns `make_rewarder` of a method with `with_cloning`: it takes both's fields.
+
+    Args:
+      make_inner: the method's own (agent, **fields) -> rewarder.
+    """
+    own = {*methods.PSEUDO_ACTIONS, *methods.INVERSE_MODELS}
+
+    def make_rewarder(agent: AgentSpec, **fields: Any) -> Rewarder:
+        cloning = {name: fields.pop(name) for name in own & fields.keys()}
+        return with_cloning(make_inner(agent, **fields), agent, **cloning)
+
+    return make_rewarder
 
 
 def with_cloning(
@@ -179,10 +190,9 @@ def with_cloning(
         assert expert is not None
         inferred = infer(state.models.params, expert)
         label = jnp.mean(inferred, axis=0)
-        observation = augmentation.augment(
+        observation = agent.augment(
             jnp.asarray(expert.observation)[:num_pairs],
             jax.random.fold_in(key, _OWN_KEY),
-            padding=agent.shift_padding,
         )
         representation = apply(encoder, learner.encoder, observation)
         action = jnp.tanh(apply(actor, learner.actor, representation))
@@ -210,14 +220,8 @@ def with_cloning(
         samples = inner_samples(view, expert)
         return term + rewarder.actor_loss(state.inner, learner, *samples, key)
 
-    def observe(
-        state: CloningState,
-        learner: LearnerParams,
-        episode: AnyEpisode,
-        expert_episodes: ExpertEpisodes | None,
-    ) -> CloningState:
-        inner = rewarder.observe(state.inner, learner, episode, expert_episodes)
-        return state.replace(inner=inner)
+    def observe(state: CloningState, *arguments: Any) -> CloningState:
+        return state.replace(inner=rewarder.observe(state.inner, *arguments))
 
     def of_inner(function: Any) -> Any:
         """Returns an inner function of the whole state; None where there is none."""
@@ -225,15 +229,13 @@ def with_cloning(
             return None
         return lambda state, *arguments: function(state.inner, *arguments)
 
-    return Rewarder(
-        of_inner(rewarder.rewards),
-        init,
-        update,
-        observe,
+    return rewarder._replace(
+        rewards=of_inner(rewarder.rewards),
+        init=init,
+        update=update,
+        observe=observe,
         expert_batch_size=expert_batch_size,
-        matches_episodes=rewarder.matches_episodes,
         samples_successors=True,
-        ignores_padding=rewarder.ignores_padding,
         relabel=of_inner(rewarder.relabel),
         rewards_changed=of_inner(rewarder.rewards_changed),
         actor_loss=actor_loss,

@@ -1,9 +1,8 @@
 """P-SIL whose actor also clones actions that inverse models infer for the video."""
 
 from jaxil import methods
-from jaxil.learner.rewarder import AgentSpec, Rewarder
 from jaxil.rewarders import psil
-from jaxil.rewarders.inferred_actions import with_cloning
+from jaxil.rewarders.inferred_actions import add_cloning
 
 METHOD = methods.Method(
     name="psil_cloning",
@@ -24,44 +23,4 @@ METHOD = methods.Method(
     ),
 )
 
-
-def make_rewarder(
-    agent: AgentSpec,
-    *,
-    cost: str,
-    alignment: str,
-    epsilon: float,
-    num_iterations: int,
-    target_update_steps: int,
-    return_scale: float,
-    num_components: int,
-    num_pairs: int,
-    weight: float,
-    trust: str,
-    trust_scale: float,
-    num_models: int,
-    head_dim: int,
-    model_learning_rate: float,
-) -> Rewarder:
-    """Returns `psil.make_rewarder` with `with_cloning`; see there for the arguments."""
-    inner = psil.make_rewarder(
-        agent,
-        cost=cost,
-        alignment=alignment,
-        epsilon=epsilon,
-        num_iterations=num_iterations,
-        target_update_steps=target_update_steps,
-        return_scale=return_scale,
-        num_components=num_components,
-    )
-    return with_cloning(
-        inner,
-        agent,
-        num_pairs=num_pairs,
-        weight=weight,
-        trust=trust,
-        trust_scale=trust_scale,
-        num_models=num_models,
-        head_dim=head_dim,
-        model_learning_rate=model_learning_rate,
-    )
+make_rewarder = add_cloning(psil.make_rewarder)

@@ -1,12 +1,13 @@
 """No reward at all: the control that every method has to beat."""
 
+from typing import Any
+
 import jax.numpy as jnp
 from jax import Array
 
 from jaxil import methods
-from jaxil.learner.rewarder import AgentSpec, Rewarder, RewarderState
-from jaxil.learner.state import LearnerParams
-from jaxil.maths.types import AnyEpisode, ExpertEpisodes
+from jaxil.learner.rewarder import AgentSpec, Rewarder
+from jaxil.maths.types import AnyEpisode
 
 METHOD = methods.Method(
     name="zero",
@@ -24,12 +25,7 @@ def make_rewarder(agent: AgentSpec) -> Rewarder:
     return Rewarder(zero_rewards, ignores_padding=True)
 
 
-def zero_rewards(
-    state: RewarderState,
-    learner: LearnerParams,
-    episode: AnyEpisode,
-    expert_episodes: ExpertEpisodes | None,
-) -> Array:
+def zero_rewards(state: Any, learner: Any, episode: AnyEpisode, *_: Any) -> Array:
     """Returns zeros [T]."""
-    del state, learner, expert_episodes
+    del state, learner
     return jnp.zeros_like(episode.rewards)
