@@ -1,7 +1,6 @@
 """The table of methods: what files declare, and methods from outside."""
 
 import ast
-import inspect
 import os
 import pathlib
 
@@ -12,8 +11,10 @@ from jaxil import config as jaxil_config
 from jaxil.errors import UsageError
 from jaxil.presets import tiny
 from tests.commands import ROOT, SMALL, call, small_run
+from tests.learner.small_learner import make_learner
 from tests.processes import run_python
 from tests.reporting.run_folders import change_config, write_run
+from tests.tiny_agent import make_agent
 
 _DECLARED = {
     path.stem: path
@@ -67,18 +68,26 @@ def test_every_declaration_is_known_by_the_name_of_its_file():
 
 
 @each_method
-def test_fields_are_keywords_of_the_functions_that_take_them(name):
+def test_its_functions_take_every_field_need_each_and_refuse_others(name):
     method = methods.get(name)
-    fields = [field for section in method.sections.values() for field in section]
-    assert len(set(fields)) == len(fields)  # sections are merged into one call
-    for function in filter(None, (method.make_rewarder, method.make_update_step)):
-        parameters = inspect.signature(methods.load(name, function)).parameters
-        keywords = {
-            parameter.name
-            for parameter in parameters.values()
-            if parameter.kind is parameter.KEYWORD_ONLY
-        }
-        assert keywords == set(fields)
+    declared = [
+        item for section in method.sections.values() for item in section.items()
+    ]
+    fields = {field: settings.default for field, settings in declared}
+    assert len(fields) == len(declared)  # sections are merged into one call
+
+    def make(fields):
+        rewarder = methods.load(name, method.make_rewarder)(make_agent(), **fields)
+        if method.make_update_step is not None:
+            make_step = methods.load(name, method.make_update_step)
+            make_step(make_learner(rewarder), **fields)
+
+    make(fields)
+    for field in fields:
+        with pytest.raises((KeyError, TypeError), match=field):
+            make({other: fields[other] for other in fields if other != field})
+    with pytest.raises(TypeError, match="no_such_field"):
+        make(fields | {"no_such_field": 1})
 
 
 @each_method

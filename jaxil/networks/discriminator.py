@@ -90,13 +90,12 @@ class PatchDiscriminator(nn.Module):
         layers = (self.width, 2), (2 * self.width, 1), (4 * self.width, 1), (1, 1)
         for number, (features, stride) in enumerate(layers):
             x = nn.leaky_relu(x, 0.2) if number else x
-            layer = Convolution(
+            x = Convolution(
                 features,
                 kernel_size=4,
                 stride=stride,
                 padding=1,
                 by_windows=self.by_windows,
                 name=f"Conv_{number}",
-            )
-            x = layer(x)
+            )(x)
         return x.reshape(len(x), -1)

@@ -111,7 +111,6 @@ def make_update_step(
         assert batch.successor is not None
         assert expert is not None
         assert expert.successor is not None
-        chex.assert_equal_shape([batch.observation, batch.successor])
         chex.assert_equal_shape([expert.observation, expert.successor])
         chex.assert_axis_dimension(expert.observation, 0, batch_size)
         step_key = jax.random.fold_in(state.key, state.num_updates)

@@ -119,7 +119,8 @@ def make_rewarder(
 
     For the arguments see `make_update_step`.
     """
-    embedding, model = _modules(agent.networks, fields)
+    sizes = {name: fields[name] for name in _SIZES}
+    embedding, model = _modules(agent.networks, sizes)
 
     def init(key: Array, spec: Spec, *_: Any) -> LatentState:
         keys = jax.random.split(key)
@@ -148,7 +149,7 @@ def make_update_step(
     commitment: float,
     prediction_weight: float,
     target_tau: float,
-    **sizes: int,
+    **sizes: Any,
 ) -> UpdateStep:
     """Returns the step that trains all parts at once; the critic is not used.
 
@@ -241,8 +242,6 @@ def make_update_step(
         assert batch.successor is not None
         assert expert is not None
         assert expert.successor is not None
-        chex.assert_equal_shape([batch.observation, batch.successor])
-        chex.assert_equal_shape([expert.observation, expert.successor])
         chex.assert_axis_dimension(expert.observation, 0, batch_size)
         step_key = jax.random.fold_in(state.key, state.num_updates)
         play_key, video_key, expert_key = jax.random.split(step_key, 3)
@@ -279,12 +278,10 @@ def make_update_step(
 
 
 def _modules(
-    networks: AgentNetworks, fields: Mapping[str, Any]
+    networks: AgentNetworks, sizes: Mapping[str, Any]
 ) -> tuple[Embedding, LatentActionModel]:
     actor = networks.actor
     model = LatentActionModel(
-        **{name: fields[name] for name in _SIZES},
-        feature_dim=actor.feature_dim,
-        action_dim=actor.action_dim,
+        **sizes, feature_dim=actor.feature_dim, action_dim=actor.action_dim
     )
     return Embedding(networks.encoder, actor.feature_dim), model

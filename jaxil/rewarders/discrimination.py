@@ -179,13 +179,13 @@ def make_transition_rewarder(
         chex.assert_axis_dimension(expert.observation, 0, batch_size)
         chex.assert_equal_shape([expert.observation, expert.successor])
         *keys, penalty_key = jax.random.split(key, 3)
-        pairs = zip((expert.observation, expert.successor), keys, strict=True)
+        observations = expert.observation, expert.successor
         return update_discriminator(
             state,
             judge.logits,
             tuple(
-                judge.inputs(learner, agent.augment(observation, k))
-                for observation, k in pairs
+                judge.inputs(learner, augmented)
+                for augmented in map(agent.augment, observations, keys)
             ),
             jax.tree.map(lambda x: x[:batch_size], judge.agent_inputs(view)),
             penalty_key,
