@@ -32,28 +32,18 @@ def printable(text: object, max_length: int = 1000) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """One reason why a request is invalid.
+    """One reason why a request is invalid: a sentence that starts with `subject`."""
 
-    Attributes:
-      subject: the config field, flag or file.
-      rule: what is wrong with it, completing a sentence that starts with `subject`.
-      way_out: what to do instead; empty if the rule says it.
-      value: what was given.
-    """
-
-    subject: str
-    rule: str
-    way_out: str = ""
-    value: Any = _ABSENT
+    subject: str  # the config field, flag or file
+    rule: str  # what is wrong with it
+    way_out: str = ""  # what to do instead; empty if the rule says it
+    value: Any = _ABSENT  # what was given
 
     def __str__(self) -> str:
-        given = (
-            ""
-            if self.value is _ABSENT
-            else f"={printable(repr(self.value), _MAX_VALUE)}"
-        )
-        end = f"; {self.way_out}" if self.way_out else ""
-        return f"{self.subject}{given} {self.rule}{end}"
+        end = f" {self.rule}; {self.way_out}" if self.way_out else f" {self.rule}"
+        if self.value is _ABSENT:
+            return f"{self.subject}{end}"
+        return f"{self.subject}={printable(repr(self.value), _MAX_VALUE)}{end}"
 
     def __hash__(self) -> int:
         return hash(str(self))  # values need not be hashable
@@ -78,6 +68,15 @@ class UsageError(Exception):
         return "Several faults:\n" + "\n".join(f"  - {f}" for f in shown)
 
 
+@contextlib.contextmanager
+def collecting(faults: list[str | Fault]) -> Iterator[None]:
+    """Adds the faults of a UsageError in this block to a list, and goes on."""
+    try:
+        yield
+    except UsageError as error:
+        faults += error.faults
+
+
 class RunFailed(RuntimeError):
     """The run cannot continue; the message says why."""
 
@@ -98,12 +97,9 @@ class TrainingDiverged(RunFailed):
 def told_as(
     who: str, what: str, kind: type[RunFailed] = EnvironmentsFailed
 ) -> Iterator[None]:
-    """Raises a RunFailed for any error of the user's code in this block.
+    """Raises a RunFailed of a kind for any error of the user's code in this block.
 
-    Args:
-      who: "the task", "the policy" or a method's name, for the message.
-      what: what was being done.
-      kind: what is raised.
+    It names `who`, such as "the task" or a method, and `what` was being done.
     """
     try:
         yield
@@ -145,11 +141,10 @@ def _is_known(file: str) -> bool:
 
 def unknown_name(subject: str, value: object, known: Sequence[str]) -> Fault:
     """Returns the fault of an unknown name, with the closest known ones."""
-    if len(known) <= _SHORT_LIST:
-        return Fault(
-            subject, "is unknown", f"choose one of: {', '.join(known)}", value=value
-        )
-    close = difflib.get_close_matches(str(value), known, n=3, cutoff=0.5)
-    shown = ", ".join(close) if close else f"{', '.join(known[:_SHORT_LIST])}, ..."
+    close = []
+    if len(known) > _SHORT_LIST:
+        close = difflib.get_close_matches(str(value), known, n=3, cutoff=0.5)
+    more = ["..."] if len(known) > _SHORT_LIST else []
     hint = "did you mean" if close else "choose one of"
-    return Fault(subject, "is unknown", f"{hint}: {shown}", value=value)
+    shown = ", ".join(close or [*known[:_SHORT_LIST], *more])
+    return Fault(subject, "is unknown", f"{hint}: {shown}", value)

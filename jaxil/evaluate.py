@@ -16,7 +16,6 @@ from jaxil import command
 from jaxil.errors import UsageError
 
 _FIRST_EPISODE = 1_000_000  # training evaluates on none of these starts
-_GIF_FPS = 12.5
 
 
 def main(argv: list[str]) -> None:
@@ -82,33 +81,18 @@ def _evaluate(
             image_size=values.video_size,
             shows_progress=True,
         )
-        stem = folder / "videos" / f"evaluation_{policy.frame:09d}"
-        _write_videos(stem, sides, gif=values.gif)
-
-
-def _write_videos(stem: pathlib.Path, sides: list[Any], *, gif: bool) -> None:
-    """Writes `film.Side`s beside each other: `stem`.mp4, and on request a GIF."""
-    from jaxil.files import video
-    from jaxil.training import run_log
-
-    frames, captions = zip(*sides)
-    fps = run_log.frames_per_second(len(frames[0]))
-    film_file, gif_file = stem.with_suffix(".mp4"), stem.with_suffix(".gif")
-    try:
-        stem.parent.mkdir(exist_ok=True)
-        video.write_video(film_file, *frames, fps=fps, labels=captions)
-        print(f"video: {film_file}")
-        if gif:
-            stride = round(fps / _GIF_FPS)
-            fewer = [each[::stride] for each in frames]
-            texts = [each[::stride] for each in captions]
-            video.write_gif(gif_file, *fewer, fps=fps / stride, labels=texts)
-            print(f"gif: {gif_file}")
-    except OSError as error:
-        raise UsageError(
-            f"{stem.parent} cannot be written ({error.strerror or error}); make room or"
-            " make it writable, or evaluate a copy of the run"
-        ) from error
+        videos = folder / "videos"
+        try:
+            videos.mkdir(exist_ok=True)
+            for kind, suffix in (("video", "mp4"), ("gif", "gif"))[: 1 + values.gif]:
+                path = videos / f"evaluation_{policy.frame:09d}.{suffix}"
+                film.write(path, sides)
+                print(f"{kind}: {path}")
+        except OSError as error:
+            raise UsageError(
+                f"{videos} cannot be written ({error.strerror or error}); make room or"
+                " make it writable, or evaluate a copy of the run"
+            ) from error
 
 
 def _define(values: flags.FlagValues) -> None:

@@ -16,7 +16,7 @@ from jaxil.machine.signals import StopOnSignals
 from jaxil.maths.types import Episode
 from jaxil.training import assembly
 from jaxil.training.parts import Parts
-from jaxil.training.run_log import as_floats
+from jaxil.training.run_log import When, as_floats
 
 # NumPy's random streams. Numbers are keyed by (seed, stream, step), so a resumed run
 # repeats those of an uninterrupted one without a stored state.
@@ -42,6 +42,12 @@ class Run(Parts):
         return self.counters.num_steps * self.config.action_repeat
 
     @property
+    def now(self) -> When:
+        """How far the run has come, for its tables."""
+        seconds = time.monotonic() - self.started
+        return When(self.frame, seconds, self.counters.num_episodes)
+
+    @property
     def is_playing(self) -> bool:
         """Whether an episode has begun and not ended."""
         return self.player is not None and self.player.is_playing
@@ -49,17 +55,16 @@ class Run(Parts):
     def loop(self, *, whole_episodes: bool = True) -> None:
         """Trains until the budget is used up, or until someone asks to stop.
 
-        Args:
-          whole_episodes: whether episodes that are open when the budget ends are played
-            to their end, so that they are stored and the last evaluation takes place.
+        With `whole_episodes`, those that are open when the budget ends are played to
+        their end, so that they are stored and the last evaluation takes place.
 
         Raises:
           EnvironmentsFailed: the task raised an error, or its processes keep dying.
           TrainingDiverged: a loss, a reward or an action is not finite any more.
         """
         config, counters, player = self.config, self.counters, self.player
-        act = self.stopwatch.timed("update", self.act)
-        learn = self.stopwatch.timed("update", self.learn)
+        learning = self.stopwatch.timed("update")
+        act, learn = learning(self.act), learning(self.learn)
         if counters.owes_evaluation:
             self.evaluate()
             self.save()
@@ -89,7 +94,7 @@ class Run(Parts):
                 if self.is_due(counters.last_checkpoint_step, every):
                     self.save()
             self.progress.update(self.frame, self.stopwatch.seconds, self.returns)
-        self.stopwatch.timed("update", self.flush)()
+        learning(self.flush)()
 
     def wants_episode(self) -> bool:
         """Returns whether the budget has room for an episode beside the open ones."""
@@ -133,8 +138,7 @@ class Run(Parts):
     def update_is_due(self, before: int) -> bool:
         """Returns whether an agent step is followed by an update.
 
-        Args:
-          before: frames before that step.
+        That depends on the frames `before` it.
         """
         if self.counters.num_steps % self.config.update_every_steps:
             return False
@@ -150,26 +154,22 @@ class Run(Parts):
 
     def store(self, episode: Episode) -> None:
         """Rewards a finished episode and stores it; refreshes rewards where due."""
-        # Updates may not see an episode that is stored after they were due, and rewards
-        # come from all that was learned. Their own clock starts once that is done.
-        self.stopwatch.timed("update", self.flush)()
-        self.stopwatch.timed("update", jax.block_until_ready)(self.state.num_updates)
-        start = time.perf_counter()
-        rewards = self.reward(episode)
-        with told_as("the task", "an episode"):  # the state's numbers are not finite
-            self.replay.add_episode(**episode._replace(rewards=rewards)._asdict())
-        self.updates.episode_added()
-        self.refresh_if_due()
-        seconds = time.perf_counter() - start
-        self.stopwatch.reward_seconds += seconds
-        self.stopwatch.seconds["update"] += seconds
-
+        with self.stopwatch.timed("update"):
+            # Updates may not see an episode that is stored after they were due, and
+            # rewards come from all that was learned. Their clock starts after that.
+            self.flush()
+            jax.block_until_ready(self.state.num_updates)
+            start = time.perf_counter()
+            rewards = self.reward(episode)
+            with told_as("the task", "an episode"):  # its states may not be finite
+                self.replay.add_episode(**episode._replace(rewards=rewards)._asdict())
+            self.updates.episode_added()
+            self.refresh_if_due()
+            self.stopwatch.reward_seconds += time.perf_counter() - start
         summary = self.agent.rewarder.summary(self.state.rewarder)
         metrics = as_floats(self.counters.metrics | summary)
         metrics["replay/reward"] = self.replay.mean_reward()
         self.require_finite(metrics)
-        counters = self.counters
-        counters.seconds = time.monotonic() - self.started
         rewards_by_kind = {"task": episode.rewards, "imitation": rewards}
         self.returns = as_floats({n: np.sum(r) for n, r in rewards_by_kind.items()})
         row = {
@@ -179,8 +179,8 @@ class Run(Parts):
             "reward_seconds": round(self.stopwatch.reward_seconds, 3),
             **metrics,
         }
-        self.log.episode(self.frame, counters.seconds, counters.num_episodes, row)
-        counters.num_episodes += 1
+        self.log.episode(self.now, row)
+        self.counters.num_episodes += 1
 
     def reward(self, episode: Episode) -> np.ndarray:
         """Returns the method's rewards [T] of a finished episode, which it observes."""
@@ -234,8 +234,7 @@ class Run(Parts):
             # No episode has written these.
             metrics = as_floats(counters.metrics)
             self.require_finite(metrics)
-            seconds = time.monotonic() - self.started
-            self.log.updates(frame=self.frame, seconds=seconds, metrics=metrics)
+            self.log.updates(self.now, metrics)
         result = self.evaluator.evaluate(
             self.state,
             number=counters.num_evals,
@@ -247,21 +246,14 @@ class Run(Parts):
             return
         counters.num_evals += 1
         counters.last_eval_step = counters.num_steps
-        counters.seconds = time.monotonic() - self.started
-        line = self.log.evaluation(
-            result,
-            self.frame,
-            counters.seconds,
-            counters.num_episodes,
-            pre_tanh=float(counters.metrics.get("actor/pre_tanh", np.nan)),
-        )
-        self.progress.message(line)
+        pre_tanh = float(counters.metrics.get("actor/pre_tanh", np.nan))
+        self.progress.message(self.log.evaluation(self.now, result, pre_tanh))
 
     def save(self) -> None:
         """Writes a checkpoint: learner, counters, open and new episodes."""
         self.flush()
         self.counters.last_checkpoint_step = self.counters.num_steps
-        self.counters.seconds = time.monotonic() - self.started
+        self.counters.seconds = self.now.seconds
         open_episodes = {} if self.player is None else self.player.open_episodes
         self.checkpoints.save(
             frame=self.frame,
@@ -316,12 +308,8 @@ class Run(Parts):
 def train(config: Config, workdir: pathlib.Path) -> bool:
     """Trains a run to its end, from its newest checkpoint if there is one.
 
-    Args:
-      config: checked.
-      workdir: the run's folder, opened by `workdir.opened`.
-
-    Returns:
-      Whether the budget is used up; False when someone asked to stop.
+    Its folder must be open, see `workdir.opened`. Returns whether the budget is used
+    up; False when someone asked to stop.
 
     Raises:
       DemonstrationError: the demonstrations do not fit this run.
@@ -330,7 +318,7 @@ def train(config: Config, workdir: pathlib.Path) -> bool:
     demonstrations = assembly.load_demonstrations(config)
     method = methods.get(config.method)
     screen.say(f"{config.task}: {method.label}, {method.about}; seed {config.seed}")
-    run = Run.make(config, workdir, demonstrations, screen.say)
+    run = Run.make(config, workdir, demonstrations)
     with contextlib.closing(run), StopOnSignals(run.ask_to_stop):
         try:
             run.loop()

@@ -77,9 +77,7 @@ class Dummies:
                 save=lambda **_: self.tape.append("save"), newest=lambda: 4000
             ),
             log=_part(
-                episode=lambda frame, seconds, episode, row: self.rows.append(
-                    {"frame": frame, "seconds": seconds, "episode": episode, **row}
-                ),
+                episode=lambda when, row: self.rows.append(when._asdict() | row),
                 evaluation=lambda *_, **__: "a line",
                 close=lambda: None,
             ),

@@ -130,7 +130,7 @@ def test_a_method_that_does_not_play_writes_the_row_of_a_stopped_evaluation_once
     run.player = None
     metrics = {"actor/loss": np.float32(0.5)}
     run.updates.run = lambda state: (state, metrics)
-    run.log.updates = lambda **row: updates.append((row["frame"], row["metrics"]))
+    run.log.updates = lambda when, metrics: updates.append((when.frame, metrics))
     evaluate = run.evaluator.evaluate
 
     def stopped(*arguments, **named):

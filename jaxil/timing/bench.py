@@ -44,24 +44,17 @@ class _Loop(train.Run):
 class Bench:
     """A run that has stored one episode of random actions and updated once.
 
-    Attributes:
-      run: acts and learns from the first agent step.
-      config: of the run.
-      episode: the random one.
-      batches: the agent's and the experts' batch of one update, on the host.
-      first_update_seconds: includes compilation.
+    It acts and learns from the first agent step.
     """
 
-    def __init__(
-        self, config: Config, folder: pathlib.Path, say: Callable[[str], None]
-    ) -> None:
-        """Starts the run of a checked config in a folder; `say` prints a line."""
+    def __init__(self, config: Config, folder: pathlib.Path) -> None:
+        """Starts the run of a checked config in a folder."""
         self.config = config = config.copy_and_resolve_references()
         with config.unlocked():
             config.exploration_steps = 0
             config.seed_frames = config.total_frames = config.action_repeat
         self._demonstrations = assembly.load_demonstrations(config)
-        self.run = run = _Loop.make(config, folder, self._demonstrations, say)
+        self.run = run = _Loop.make(config, folder, self._demonstrations)
         self._environment = assembly.training_environment(config)
         self._closing = contextlib.ExitStack()
         self._closing.callback(run.close)
@@ -72,7 +65,7 @@ class Bench:
         self.observation = self._environment.reset(episode=0).observation
         run.reward(self.episode)  # a rewarder may have to observe one before it learns
         self.add_episode()
-        self.batches = self.sample()
+        self.batches = self.sample()  # of one update, on the host
         # A run may dispatch several updates at once.
         self._num_updates = config.updates_per_dispatch
         dispatched: Any = self.batches
@@ -82,6 +75,7 @@ class Bench:
         self._on_device = jax.device_put(dispatched)
         begin = time.perf_counter()
         jax.block_until_ready(self.update())
+        # Compilation included.
         self.first_update_seconds = time.perf_counter() - begin
         if run.player is not None and config.num_environments > 1:
             # Start the workers and compile their policy before anything is timed.
@@ -89,9 +83,9 @@ class Bench:
             run.act(run.player.observations)
 
     def parts(self) -> dict[str, tuple[Callable[[], Any] | None, int]]:
-        """Returns the parts of a run by name, and how often one call executes each.
+        """Returns a run's parts by name, None for one that it does not have.
 
-        One that the run does not have is None.
+        With each stands how often one call executes it.
         """
         run = self.run
         return {
@@ -130,11 +124,8 @@ class Bench:
     def loop(self, steps: int, *, waits: bool) -> tuple[int, float, float]:
         """Acts and learns for `steps` agent steps, summed over all environments.
 
-        With `waits`, environments wait for each update.
-
-        Returns:
-          Environment frames, seconds, and the seconds of environments, acting and
-          updates alone.
+        With `waits`, environments wait for each update. Returns environment frames,
+        seconds, and those of them that environments, acting and updates took.
         """
         run, first_frame = self.run, self.run.frame
         run.waits, before = waits, sum(run.stopwatch.seconds.values())
@@ -143,7 +134,8 @@ class Bench:
         begin = time.perf_counter()
         run.loop(whole_episodes=False)
         # The last update may not have finished.
-        run.stopwatch.timed("update", jax.block_until_ready)(run.state.num_updates)
+        with run.stopwatch.timed("update"):
+            jax.block_until_ready(run.state.num_updates)
         seconds = time.perf_counter() - begin
         working = sum(run.stopwatch.seconds.values()) - before
         return run.frame - first_frame, seconds, working
@@ -200,8 +192,3 @@ class Bench:
             rewards=np.zeros(num_steps, np.float32),
             discounts=np.ones(num_steps, np.float32),
         )
-
-
-def num_bytes(tree: Any) -> int:
-    """Returns the size of all arrays in a tree."""
-    return sum(leaf.nbytes for leaf in jax.tree.leaves(tree))

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxil.config import Config
-from jaxil.machine import devices, memory, screen
+from jaxil.machine import devices, memory
 from jaxil.timing import start
-from jaxil.timing.bench import Bench, num_bytes
+from jaxil.timing.bench import Bench
 
 _TURNS = 4  # the loop's two forms alternate
 _SHORT_PARTS = ("physics_ms", "render_ms", "act_ms")  # get ten times the repeats
@@ -37,7 +37,7 @@ def measure(
 
     Args:
       config: checked.
-      repeats: timings of each part; the median is reported.
+      repeats: timings of each part, of which the median is reported.
       steps: agent steps to time for each of the loop's two forms.
       environment: variables of the process whose start is timed; None skips this and
         compilation without a cache.
@@ -49,7 +49,7 @@ def measure(
     """
     with (
         tempfile.TemporaryDirectory() as folder,
-        contextlib.closing(Bench(config, pathlib.Path(folder), screen.say)) as bench,
+        contextlib.closing(Bench(config, pathlib.Path(folder))) as bench,
     ):
         results: dict[str, Any] = {"ranges": {}}
         for name, (function, num_calls) in bench.parts().items():
@@ -68,9 +68,7 @@ def measure(
         results["compile_seconds"] = bench.first_update_seconds
         results |= dict.fromkeys(("start_seconds", "compile_cold_seconds"))
         if environment is not None:
-            results["start_seconds"] = start.first_step_seconds(
-                config, environment, screen.say
-            )
+            results["start_seconds"] = start.first_step_seconds(config, environment)
             results["compile_cold_seconds"] = start.compile_seconds(bench.lower)
         frames = len(bench.episode.actions) * config.action_repeat
     loop = frames / results["frames_per_second"]
@@ -107,13 +105,17 @@ def _memory(bench: Bench) -> dict[str, float | None]:
     program = bench.lower().compile().memory_analysis()
     on_device = devices.peak_bytes()
     return {
-        "learner_state_mb": num_bytes(bench.run.state) / 1e6,
-        "batch_mb": num_bytes(bench.batches) / 1e6,
+        "learner_state_mb": _num_bytes(bench.run.state) / 1e6,
+        "batch_mb": _num_bytes(bench.batches) / 1e6,
         "update_temp_mb": getattr(program, "temp_size_in_bytes", 0) / 1e6,
         "replay_gb": bench.run.replay.frames.nbytes / 1e9,
         "peak_memory_gb": memory.peak_bytes() / 1e9,
         "peak_device_memory_gb": None if on_device is None else on_device / 1e9,
     }
+
+
+def _num_bytes(tree: Any) -> int:
+    return sum(leaf.nbytes for leaf in jax.tree.leaves(tree))
 
 
 def _arithmetic(bench: Bench, update_ms: float) -> dict[str, float]:
@@ -143,10 +145,7 @@ def _product_flops_per_second() -> float:
 
 
 def timed(function: Callable[[], Any], repeats: int) -> list[float]:
-    """Returns the seconds of each call until its result is ready.
-
-    They follow one call that may compile.
-    """
+    """Returns the seconds of each call, after one that may compile."""
     jax.block_until_ready(function())
     seconds = []
     for _ in range(repeats):

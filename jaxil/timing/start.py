@@ -14,6 +14,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from jaxil import methods
 from jaxil.config import Config
+from jaxil.machine import screen
 
 _TIMEOUT_SECONDS = 600.0  # it takes 20 s on two busy cores
 # A run that prints the system's monotonic clock at its first step and exits.
@@ -39,13 +40,10 @@ def get_config():
 """
 
 
-def first_step_seconds(
-    config: Config, environment: Mapping[str, str], say: Callable[[str], None]
-) -> float | None:
+def first_step_seconds(config: Config, environment: Mapping[str, str]) -> float | None:
     """Returns the time from the command to the first step, with warm caches.
 
-    `environment` are the user's variables. If the run fails, prints a line with `say`
-    and returns None.
+    `environment` are the user's variables. If the run fails, says so and returns None.
     """
     settings = config.to_dict()
     settings["num_environments"] = 1  # so that this process steps it
@@ -72,7 +70,7 @@ def first_step_seconds(
             reason = next(iter(error.stderr.strip().splitlines()[-1:]), "no message")
         except subprocess.TimeoutExpired:
             reason = f"it took longer than {_TIMEOUT_SECONDS:.0f} s"
-    say(f"start not measured: {reason}")
+    screen.say(f"start not measured: {reason}")
     return None
 
 

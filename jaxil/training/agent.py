@@ -1,9 +1,10 @@
 """From a checked config to the compiled functions of an agent."""
 
+import dataclasses
 import inspect
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -25,11 +26,7 @@ from jaxil.learner.policy import (
 )
 from jaxil.learner.rewarder import AgentSpec, Rewarder, Spec, make_refresh
 from jaxil.learner.state import TrainState
-from jaxil.learner.update import (
-    Learner,
-    init_train_state,
-    make_update_step,
-)
+from jaxil.learner.update import Learner, init_train_state, make_update_step
 from jaxil.maths.types import AnyEpisode, Episode, ExpertEpisodes
 from jaxil.native import build, encoding
 from jaxil.networks.agent import AgentNetworks, make_agent_networks
@@ -38,41 +35,59 @@ from jaxil.training import lengths
 _MAX_UPDATES = 2**31 - 1  # an int32 counts them
 
 
-class Agent(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Agent:
     """The compiled functions of a run, and its first state.
 
-    Attributes:
-      update_step: (state, batch, expert batch, frames=None) -> (state, metrics);
-        donates state; see `gathering.make_gathering_step`.
-      repeated_step: the same for several batches, see `gathering.make_repeated_step`.
-      sample_action: see `policy.make_sample_action`.
-      mean_action: see `policy.make_mean_action`.
-      observe: (rewarder state, learner, episode, expert episodes) -> state, the
-        rewarder's; the episode is a whole one, without padding.
-      rewards: the same arguments -> the rewarder's rewards, a NumPy array [T].
-      plan: the same arguments -> the rewarder's plan, a NumPy array [T + 1, N + 1],
-        and the index of its demonstration; None where it has none.
-      compiled_length: (T) -> the length for which `observe`, `rewards`, `plan` and
-        `refresh` of an episode of T steps are compiled.
-      refresh: rewards of stored episodes as of now, see `rewarder.make_refresh`.
-      rewarder: the method itself.
-      mean_image: what the encoder subtracts, where that is the demonstrations' mean
-        image; None otherwise.
-      init_state: () -> the state before the first update.
+    Those of an episode take a whole one, without padding, after the rewarder's state
+    and the learner, and before the expert episodes.
     """
 
+    rewarder: Rewarder
+    # (state, batch, expert batch, frames=None) -> (state, metrics); donates state.
     update_step: Step
-    repeated_step: Step
+    repeated_step: Step  # the same for several batches
     sample_action: SampleAction
     mean_action: MeanAction
-    observe: Any
-    rewards: Any
-    compiled_length: Callable[[int], int]
-    refresh: Any
-    plan: Any
-    rewarder: Rewarder
-    mean_image: np.ndarray | None
-    init_state: Any
+    refresh: Any  # rewards of stored episodes as of now, see `rewarder.make_refresh`
+    mean_image: np.ndarray | None  # the demonstrations', if the encoder subtracts it
+    init_state: Callable[[], TrainState]  # the state before the first update
+    usual_steps: int  # of an episode
+    padded_observe: Any  # see `Rewarder`, like the next two
+    padded_rewards: Any
+    padded_plan: Any
+
+    def compiled_length(self, num_steps: int) -> int:
+        """Returns the length for which functions of an episode are compiled."""
+        if not self.rewarder.ignores_padding:
+            return num_steps
+        return lengths.padded_length(num_steps, self.usual_steps)
+
+    def observe(self, state: Any, params: Any, episode: Episode, experts: Any) -> Any:
+        """Returns the rewarder's state after an episode."""
+        return self.padded_observe(state, params, self._padded(episode), experts)
+
+    def rewards(
+        self, state: Any, params: Any, episode: Episode, experts: Any
+    ) -> np.ndarray:
+        """Returns an episode's rewards [T]."""
+        found = self.padded_rewards(state, params, self._padded(episode), experts)
+        return np.asarray(found)[: episode.num_steps]
+
+    def plan(
+        self, state: Any, params: Any, episode: Episode, experts: Any
+    ) -> tuple[np.ndarray, int]:
+        """Returns a plan [T + 1, N + 1], of a rewarder that has one, and whose it is.
+
+        The second is the index of the demonstration.
+        """
+        found, index = self.padded_plan(state, params, self._padded(episode), experts)
+        return np.asarray(found)[: episode.num_steps + 1], int(index)
+
+    def _padded(self, episode: Episode) -> AnyEpisode:
+        if not self.rewarder.ignores_padding:
+            return episode  # whose number of steps is known when it is compiled
+        return lengths.pad_episode(episode, self.compiled_length(episode.num_steps))
 
 
 def stack_size(config: Config) -> int:
@@ -111,10 +126,7 @@ def learning_rate(config: Config) -> optax.ScalarOrSchedule:
 def make_networks(config: Config, action_dim: int, mean: Any) -> AgentNetworks:
     """Returns the agent's networks.
 
-    Args:
-      config: checked.
-      action_dim: A.
-      mean: what the encoder subtracts, in [0, 1]: a number or [H, W, C].
+    `mean` is what the encoder subtracts, in [0, 1]: a number or [H, W, C].
     """
     return make_agent_networks(
         action_dim=action_dim,
@@ -158,8 +170,7 @@ def native_fault(config: Config) -> str | None:
 
 
 def subtracted_mean(
-    config: Config,
-    demonstrations: loading.Demonstrations | None,
+    config: Config, demonstrations: loading.Demonstrations | None
 ) -> Any:
     """Returns what the encoder subtracts: 0.5, or the demonstrations' mean image."""
     if not config.encoder.subtract_mean_image or demonstrations is None:
@@ -204,10 +215,8 @@ def make_rewarder(config: Config, networks: AgentNetworks) -> Rewarder:
 
 def _own_fields(config: Config) -> dict[str, Any]:
     """Returns the fields of a method's own sections, by name."""
-    own: dict[str, Any] = {}
-    for section in methods.get(config.method).sections:
-        own |= config[section].to_dict()
-    return own
+    sections = methods.get(config.method).sections
+    return {k: v for name in sections for k, v in config[name].to_dict().items()}
 
 
 def make_agent(
@@ -217,10 +226,7 @@ def make_agent(
 ) -> Agent:
     """Returns the compiled functions of a run.
 
-    Args:
-      config: checked.
-      environment: read for its specs and its episodes' length only.
-      demonstrations: what the method imitates, or None.
+    Of the environment, only specs and the length of episodes are read.
     """
     action_dim = environment.action_spec().shape[0]
     mean = subtracted_mean(config, demonstrations)
@@ -246,53 +252,15 @@ def make_agent(
         expert_steps=0 if frames is None else frames.shape[1] - 1,
         observation_shape=observation.shape,
     )
-    method = methods.get(config.method)
-    step = make_update_step(learner)
-    if method.make_update_step is not None:
-        make_step = methods.load(config.method, method.make_update_step)
-        with told(config.method, method.make_update_step):
-            step = make_step(learner, **_own_fields(config))
-    averages = config.policy_tau < 1.0
-    if averages:
-        step = make_averaging_step(step, tau=config.policy_tau)
-    step = make_gathering_step(step)
-
-    usual_steps = environment.episode_steps
-
-    def compiled_length(num_steps: int) -> int:
-        if not rewarder.ignores_padding:
-            return num_steps
-        return lengths.padded_length(num_steps, usual_steps)
-
-    def pad(episode: Episode) -> AnyEpisode:
-        if not rewarder.ignores_padding:
-            return episode  # whose number of steps is known when it is compiled
-        return lengths.pad_episode(episode, compiled_length(episode.num_steps))
-
-    compiled_observe = jax.jit(rewarder.observe)
-    compiled_rewards = jax.jit(rewarder.rewards)
-    compiled_plan = None if rewarder.plan is None else jax.jit(rewarder.plan)
-
-    def observe(state: Any, params: Any, episode: Episode, experts: Any) -> Any:
-        return compiled_observe(state, params, pad(episode), experts)
-
-    def rewards(state: Any, params: Any, episode: Episode, experts: Any) -> np.ndarray:
-        found = compiled_rewards(state, params, pad(episode), experts)
-        return np.asarray(found)[: episode.num_steps]
-
-    def plan(
-        state: Any, params: Any, episode: Episode, experts: Any
-    ) -> tuple[np.ndarray, int]:
-        assert compiled_plan is not None
-        found, index = compiled_plan(state, params, pad(episode), experts)
-        return np.asarray(found)[: episode.num_steps + 1], int(index)
+    step = make_gathering_step(_make_step(config, learner))
 
     def init_state() -> TrainState:
         key = jax.random.key(config.seed)
         state = init_train_state(learner, key, observation, spec)
-        return begin_average(state) if averages else state
+        return begin_average(state) if config.policy_tau < 1.0 else state
 
     return Agent(
+        rewarder=rewarder,
         # The old state is dead after the call, so XLA may reuse its memory.
         update_step=jax.jit(step, donate_argnums=0),
         repeated_step=jax.jit(make_repeated_step(step), donate_argnums=0),
@@ -300,16 +268,31 @@ def make_agent(
             make_sample_action(networks, exploration_schedule(config))
         ),
         mean_action=jax.jit(make_mean_action(networks)),
-        observe=observe,
-        rewards=rewards,
-        compiled_length=compiled_length,
         refresh=jax.jit(make_refresh(rewarder)),
-        plan=None if rewarder.plan is None else plan,
-        rewarder=rewarder,
         mean_image=mean if isinstance(mean, np.ndarray) else None,
         # Compiled, and cached: dispatched one by one, its 450 operations take longer.
         init_state=jax.jit(init_state),
+        usual_steps=environment.episode_steps,
+        padded_observe=jax.jit(rewarder.observe),
+        padded_rewards=jax.jit(rewarder.rewards),
+        padded_plan=None if rewarder.plan is None else jax.jit(rewarder.plan),
     )
+
+
+def _make_step(config: Config, learner: Learner) -> Step:
+    """Returns the method's update step, which averages policies if they are averaged.
+
+    Raises:
+      UsageError, MethodError: its own `make_update_step` fails.
+    """
+    step, method = make_update_step(learner), methods.get(config.method)
+    if method.make_update_step is not None:
+        make_step = methods.load(config.method, method.make_update_step)
+        with told(config.method, method.make_update_step):
+            step = make_step(learner, **_own_fields(config))
+    if config.policy_tau < 1.0:
+        step = make_averaging_step(step, tau=config.policy_tau)
+    return step
 
 
 def expert_episodes(

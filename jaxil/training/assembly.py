@@ -18,15 +18,21 @@ from jaxil.environments.pool import Pool
 from jaxil.environments.suite import known_tasks
 from jaxil.environments.tasks import make_environment
 from jaxil.errors import Fault, UsageError
-from jaxil.machine import memory
+from jaxil.machine import memory, screen
 from jaxil.machine.progress import shown
 from jaxil.native import build
 from jaxil.replay.replay import Replay
 from jaxil.training import loggers
 from jaxil.training.agent import native_fault, stack_size
+from jaxil.training.stopwatch import Stopwatch, TimedEnvironments
 
 # Added to the run's seed, so that evaluations do not start as training episodes do.
 EVALUATION_SEED = 1_000_003
+# Those that `tasks.make_environment` takes.
+_ENVIRONMENT_FIELDS = (
+    *("action_repeat", "image_size", "frame_stack", "render_quality", "observation"),
+    *("camera", "distraction", "max_episode_frames"),
+)
 # With a fault in one of these, the demonstrations are not opened.
 _READING_FIELDS = {
     "method",
@@ -47,7 +53,7 @@ def problems(config: Config) -> list[Fault]:
     if isinstance(config.logger, str):
         faults += loggers.problems(config.logger)
     bad = {fault.subject.partition(".")[0] for fault in faults}
-    if not bad & {"task", "method", *_environment_settings(config)}:
+    if not bad & {"task", "method", *_ENVIRONMENT_FIELDS}:
         checks_length = not bad & {"replay_size_steps", "num_steps"}
         found = task_problems(config, checks_length=checks_length)
         faults += found
@@ -55,22 +61,16 @@ def problems(config: Config) -> list[Fault]:
     if config.encoder.convolutions == "native" and not bad & {"encoder", "method"}:
         fault = native_fault(config) or build.problem()
         if fault is not None:
-            faults.append(
-                Fault(
-                    "encoder.convolutions",
-                    f"is not available: {fault}",
-                    "'auto' takes XLA's where it has to",
-                    "native",
-                )
-            )
+            rule = f"is not available: {fault}"
+            way_out = "'auto' takes XLA's where it has to"
+            faults.append(Fault("encoder.convolutions", rule, way_out, "native"))
     if not bad & _READING_FIELDS and jaxil_config.uses_demonstrations(config):
         fault = demonstration_fault(config)
         if fault is not None:
             source, way_out = config.demonstrations.source, ""
             if not methods.get(config.method).uses_demonstrations:
-                way_out = (
-                    "only the mean image needs them: encoder.subtract_mean_image=False"
-                )
+                setting = "encoder.subtract_mean_image=False"
+                way_out = f"only the mean image needs them: {setting}"
             faults.append(Fault(f"demonstrations.source={source!r}:", fault, way_out))
     return faults
 
@@ -109,9 +109,7 @@ def demonstration_fault(config: Config) -> str | None:
 def renderer_name(config: Config, *, films: bool) -> str:
     """Returns what GL calls the device that renders here; "none" if nothing does.
 
-    Args:
-      config: checked.
-      films: whether a run on state vectors has to render too, for its videos.
+    A run on state vectors has to render only if it `films`.
 
     Raises:
       UsageError: nothing here can render, but the run needs it.
@@ -149,19 +147,12 @@ def make_player(
     *,
     first_episode: int,
     open_episodes: Mapping[int, np.ndarray],
-    timed: Callable[[Any], Any],
-    say: Callable[[str], None],
+    stopwatch: Stopwatch,
 ) -> Player | None:
-    """Returns what plays episodes; None for a method that does not play.
+    """Returns what plays episodes, see `Player`; None for a method that does not play.
 
-    Args:
-      config: checked.
-      environment: the training environment, the player's from now on: it is closed if
-        there is none, or if several are made like it.
-      first_episode: see `Player`.
-      open_episodes: see `Player`.
-      timed: wraps the environments, to measure their time.
-      say: prints a line.
+    The training environment is the player's from now on: it is closed if there is none,
+    or if several are made like it.
     """
     if not methods.get(config.method).plays:
         environment.close()
@@ -177,23 +168,16 @@ def make_player(
             **_environment_settings(config),
         )
         environment.close()
-        environments = Pool(make, config.num_environments, say=say)
+        environments = Pool(make, config.num_environments, say=screen.say)
     return Player(
-        timed(environments), first_episode=first_episode, open_episodes=open_episodes
+        TimedEnvironments(environments, stopwatch),
+        first_episode=first_episode,
+        open_episodes=open_episodes,
     )
 
 
 def _environment_settings(config: Config) -> dict[str, Any]:
-    return {
-        "action_repeat": config.action_repeat,
-        "image_size": config.image_size,
-        "frame_stack": config.frame_stack,
-        "render_quality": config.render_quality,
-        "observation": config.observation,
-        "camera": config.camera,
-        "distraction": config.distraction,
-        "max_episode_frames": config.max_episode_frames,
-    }
+    return {name: config[name] for name in _ENVIRONMENT_FIELDS}
 
 
 def load_demonstrations(config: Config) -> loading.Demonstrations | None:

@@ -45,17 +45,9 @@ class Checkpoints:
     """Saves and restores a run in its working folder."""
 
     def __init__(
-        self,
-        workdir: str | os.PathLike,
-        *,
-        say: Callable[[str], None] = screen.say,
+        self, workdir: str | os.PathLike, *, say: Callable[[str], None] = screen.say
     ):
-        """Writes nothing before the first save.
-
-        Args:
-          workdir: the run's folder.
-          say: prints a line, for example on a damaged checkpoint.
-        """
+        """Writes nothing before the first save; `say` tells of what is damaged."""
         # orbax wants absolute paths.
         self._workdir = pathlib.Path(workdir).absolute()
         self._checkpoints = self._workdir / "checkpoints"
@@ -87,12 +79,12 @@ class Checkpoints:
           counters: what else the run needs to resume, as JSON: integers of any size
             are kept, tuples come back as lists.
           replay: only read.
-          mean_image: what the encoder subtracts, unless that is a constant. Saved so
-            that a policy can be used without the demonstrations.
+          mean_image: what the encoder subtracts, unless that is a constant, so that a
+            policy can be used without the demonstrations.
 
         Raises:
-          CheckpointError: if the folder has checkpoints and none was restored.
-          RunFolderError: if a file cannot be written; earlier checkpoints stay usable.
+          CheckpointError: the folder has checkpoints and none was restored.
+          RunFolderError: a file cannot be written; earlier checkpoints stay usable.
         """
         if self._last is None and self._committed():
             raise CheckpointError(
@@ -101,69 +93,58 @@ class Checkpoints:
                 " --workdir"
             )
         with run_folder.writes_to(self._workdir):
-            images = {} if mean_image is None else {_MEAN_IMAGE: mean_image}
-            self._save(frame, learner_state, counters, replay, images)
+            for folder in (self._checkpoints, self._replay):
+                folder.mkdir(exist_ok=True)
+                writing.remove_leftovers(folder)
+            # One newer than the one restored is damaged: it goes before its episodes.
+            for path in self._committed():
+                if self._last is not None and _order(path) > _order(self._last):
+                    self._delete(path)
 
-    def _save(
-        self,
-        frame: int,
-        learner_state: Any,
-        counters: dict,
-        replay: Replay,
-        arrays: dict[str, np.ndarray],
-    ) -> None:
-        for folder in (self._checkpoints, self._replay):
-            folder.mkdir(exist_ok=True)
-            writing.remove_leftovers(folder)
-        # Newer than the one restored means damaged: it must go before its episodes do.
-        for path in self._committed():
-            if self._last is not None and _order(path) > _order(self._last):
+            episodes, added = replay.episodes, replay.num_episodes_added
+            for index in episodes:
+                if index >= self._num_episodes_saved:
+                    checksum = episode_files.write(self._replay, replay, index)
+                    self._checksums[index] = checksum
+            rewards = [replay.rewards(index) for index in episodes]
+            record = {
+                "counters": counters,
+                "oldest_episode": replay.oldest_episode,
+                "num_episodes": added,
+                "episodes": episodes,
+                "episode_steps": [len(each) for each in rewards],
+                "episode_checksums": [self._checksums[index] for index in episodes],
+            }
+            path = self._free_path(frame)
+            with writing.replacing(path) as temporary:
+                all_rewards = np.concatenate([*rewards, np.zeros(0, np.float32)])
+                arrays = {_REWARDS: all_rewards}
+                if mean_image is not None:
+                    arrays[_MEAN_IMAGE] = mean_image
+                learner_files.write(temporary, learner_state, record, arrays)
+            self._remember(path, record)
+
+            kept = self._committed()[-_NUM_KEPT:]
+            for path in self._committed()[:-_NUM_KEPT]:
                 self._delete(path)
-
-        episodes, added = replay.episodes, replay.num_episodes_added
-        for index in episodes:
-            if index >= self._num_episodes_saved:
-                checksum = episode_files.write(self._replay, replay, index)
-                self._checksums[index] = checksum
-        rewards = [replay.rewards(index) for index in episodes]
-        record = {
-            "counters": counters,
-            "oldest_episode": replay.oldest_episode,
-            "num_episodes": added,
-            "episodes": episodes,
-            "episode_steps": [len(each) for each in rewards],
-            "episode_checksums": [self._checksums[index] for index in episodes],
-        }
-        path = self._free_path(frame)
-        with writing.replacing(path) as temporary:
-            all_rewards = np.concatenate([*rewards, np.zeros(0, np.float32)])
-            arrays = {_REWARDS: all_rewards, **arrays}
-            learner_files.write(temporary, learner_state, record, arrays)
-        self._remember(path, record)
-
-        kept = self._committed()[-_NUM_KEPT:]
-        for path in self._committed()[:-_NUM_KEPT]:
-            self._delete(path)
-        # A checkpoint of an earlier process may need any episode.
-        needed = min(self._oldest_episode.get(path, 0) for path in kept)
-        episode_files.remove_except(self._replay, needed, added)
+            # A checkpoint of an earlier process may need any episode.
+            needed = min(self._oldest_episode.get(path, 0) for path in kept)
+            episode_files.remove_except(self._replay, needed, added)
 
     def restore(self, abstract_learner_state: Any, replay: Replay) -> tuple[Any, dict]:
         """Reads the newest checkpoint, or the one before it if that is damaged.
 
-        Damaged episodes are left out of the replay and reported.
-
         Args:
-          abstract_learner_state: pytree of the same structure with the shapes and
-            dtypes of its leaves, from jax.eval_shape.
-          replay: emptied, then filled with the checkpoint's episodes.
+          abstract_learner_state: from jax.eval_shape.
+          replay: emptied, then filled with the checkpoint's episodes; damaged ones are
+            left out and reported.
 
         Returns:
           The learner state, on jax's default device, and the counters.
 
         Raises:
-          CheckpointError: if there is no checkpoint, none can be read, or it is of
-            another learner.
+          CheckpointError: there is no checkpoint, none can be read, or it is of another
+            learner.
         """
         path, record, learner_state = self._read(
             functools.partial(learner_files.as_state, abstract_learner_state)

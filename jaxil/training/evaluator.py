@@ -1,5 +1,6 @@
 """Evaluations of a run: episodes of the mean action, with their imitation rewards."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -18,38 +19,23 @@ _STRIP_FRAMES = 10
 
 
 class Result(NamedTuple):
-    """One evaluation.
-
-    Attributes:
-      evaluation: what was played.
-      distance: to the expert, relative to a random policy's; None if unknown.
-      sides: of the video; empty without one.
-      filmed: arrays that belong to the video, see `Evaluator.explain`.
-    """
+    """One evaluation."""
 
     evaluation: Evaluation
-    distance: float | None
-    sides: list[film.Side]
-    filmed: dict[str, np.ndarray]
+    distance: float | None  # to the expert, relative to a random policy's, if known
+    sides: list[film.Side]  # of the video; empty without one
+    filmed: dict[str, np.ndarray]  # beside the video, see `Evaluator.explain`
 
 
+@dataclasses.dataclass(frozen=True)
 class Evaluator:
     """Evaluates a policy in an environment that training does not use."""
 
-    def __init__(
-        self,
-        config: Config,
-        agent: Agent,
-        environment: PixelEnvironment,
-        experts: ExpertEpisodes | None,
-        distance: ExpertDistance | None,
-    ) -> None:
-        """See `parts.Parts.make`."""
-        self._config = config
-        self._agent = agent
-        self.environment = environment
-        self._experts = experts
-        self._distance = distance
+    config: Config
+    agent: Agent
+    environment: PixelEnvironment
+    experts: ExpertEpisodes | None
+    distance: ExpertDistance | None
 
     def evaluate(
         self,
@@ -59,24 +45,20 @@ class Evaluator:
         is_last: bool,
         stop_asked: Callable[[], bool],
     ) -> Result | None:
-        """Plays the episodes of one evaluation.
+        """Plays the episodes of one evaluation; returns None if it was stopped.
 
         Args:
           state: the learner's.
           number: evaluations before this one, which fixes the episodes' starts.
           is_last: whether the run ends with it, so that it is filmed.
           stop_asked: asked between agent steps.
-
-        Returns:
-          None if it was stopped.
         """
-        config = self._config
+        config = self.config
         encoder, actor = state.policy
 
         def act(observation: np.ndarray) -> np.ndarray:
-            return np.asarray(
-                self._agent.mean_action(encoder, actor, observation[None])
-            )[0]
+            actions = self.agent.mean_action(encoder, actor, observation[None])
+            return np.asarray(actions)[0]
 
         every = config.video_every_evals
         films = every > 0 and (number % every == 0 or is_last)
@@ -87,13 +69,13 @@ class Evaluator:
                 act,
                 num_episodes=config.num_eval_episodes,
                 first_episode=first_episode,
-                num_kept=1 if self._distance is None else MAX_EPISODES,
+                num_kept=1 if self.distance is None else MAX_EPISODES,
                 record=film.recorder(self.environment, film.SIZE) if films else None,
                 stop_asked=stop_asked,
             )
             distance, sides, filmed = None, [], {}
-            if self._distance is not None:
-                distance = self._distance.relative_distance(
+            if self.distance is not None:
+                distance = self.distance.relative_distance(
                     evaluation.episodes, stop_asked=stop_asked
                 )
             if films:
@@ -116,27 +98,25 @@ class Evaluator:
         self.environment.close()
 
     def explain(self, state: TrainState, episode: Episode) -> dict[str, np.ndarray]:
-        """Returns an episode's rewards and transport plan, for videos and reports.
+        """Returns what videos and reports show of an episode.
 
-        Returns:
-          `task_rewards` [T], `imitation_rewards` [T]; `step_seconds`, if known; and if
-          the method has one, the transport plan `plan` [T + 1, N + 1] with evenly
-          spaced frames of both episodes, `agent_strip` and `expert_strip`
-          [10, H, W, 3], if it sees pixels.
+        `task_rewards` [T], `imitation_rewards` [T]; `step_seconds`, if known; and if
+        the method has one, the transport plan `plan` [T + 1, N + 1], and if it sees
+        pixels, `agent_strip` and `expert_strip` [10, H, W, 3], evenly spaced frames.
         """
-        arguments = (state.rewarder, state.params, episode, self._experts)
+        arguments = (state.rewarder, state.params, episode, self.experts)
         found = {
             "task_rewards": episode.rewards,
-            "imitation_rewards": np.asarray(self._agent.rewards(*arguments)),
+            "imitation_rewards": np.asarray(self.agent.rewards(*arguments)),
         }
         seconds = self.environment.step_seconds
         if seconds is not None:
             found["step_seconds"] = np.asarray(seconds)
-        if self._agent.plan is not None:
-            assert self._experts is not None
-            plan, index = self._agent.plan(*arguments)
-            length = int(self._experts.num_frames[index])
-            expert_frames = self._experts.frames[index]
+        if self.agent.rewarder.plan is not None:
+            assert self.experts is not None
+            plan, index = self.agent.plan(*arguments)
+            length = int(self.experts.num_frames[index])
+            expert_frames = self.experts.frames[index]
             found["plan"] = plan[:, :length]
             if expert_frames.ndim == 4:
                 found["agent_strip"] = _strip(episode.frames)

@@ -65,9 +65,9 @@ class ExpertDistance:
         workdir: pathlib.Path,
         demonstrations: loading.Demonstrations,
     ) -> None:
-        """Embeds the demonstrations; the first use plays the random policy.
+        """Embeds the demonstrations.
 
-        The random policy's distance is stored in `workdir`, the run's folder.
+        The first use plays the random policy, whose distance is stored in `workdir`.
         """
         self._config = config
         self._path = workdir / "random_policy.json"
@@ -83,14 +83,10 @@ class ExpertDistance:
         *,
         stop_asked: Callable[[], bool] = lambda: False,
     ) -> float:
-        """Returns the distance of an evaluation's episodes; a random policy has 1.
-
-        Args:
-          episodes: at most MAX_EPISODES are used.
-          stop_asked: asked before each step of the random policy.
+        """Returns the distance of an evaluation's first MAX_EPISODES episodes.
 
         Raises:
-          Stopped: `stop_asked` said so.
+          Stopped: `stop_asked`, asked before each step of the random policy, said so.
           RunFolderError: the random policy's distance cannot be stored.
         """
         return self._distance(episodes) / self._of_random_policy(stop_asked)
@@ -133,10 +129,8 @@ class ExpertDistance:
 def make_random_embedding(frame_shape: tuple[int, ...], frame_stack: int) -> Any:
     """Returns a function: frames of an episode [T, *frame_shape] -> features [64, 50].
 
-    Args:
-      frame_shape: (H, W, 3), or (S,) for state vectors. Small images get as many
-        layers as they have pixels for.
-      frame_stack: frames in an observation.
+    Frames are [H, W, 3], or [S] of state vectors. Small images get as many layers as
+    they have pixels for.
     """
     module = Embedding(_random_encoder(frame_shape), _FEATURE_DIM)
     stacked = (*frame_shape[:-1], frame_shape[-1] * frame_stack)

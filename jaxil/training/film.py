@@ -1,6 +1,7 @@
 """Films for people to watch: an episode of a policy beside the expert's."""
 
 import contextlib
+import pathlib
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -15,24 +16,21 @@ from jaxil.environments import suite
 from jaxil.environments.evaluation import Evaluation, Stopped
 from jaxil.environments.pixel_environment import PixelEnvironment
 from jaxil.errors import told_as
+from jaxil.files import video
 from jaxil.machine import progress, screen
 from jaxil.training import assembly
 
 SIZE = 256  # pixels of a side, unless another is asked for
 _VIEW_SHARE = 0.3  # of a side, for the inset with what the agent sees
 _BORDER = 1  # pixels around the inset
+_GIF_FPS = 12.5
 
 
 class Side(NamedTuple):
-    """One of the two episodes.
+    """One of the two episodes."""
 
-    Attributes:
-      frames: uint8 [T + 1, H, W, 3].
-      captions: of each frame: whose episode, time, return so far, newest reward.
-    """
-
-    frames: np.ndarray
-    captions: list[str]
+    frames: np.ndarray  # uint8 [T + 1, H, W, 3]
+    captions: list[str]  # whose episode, time, return so far, newest reward
 
 
 def recorder(environment: PixelEnvironment, image_size: int) -> Callable[[], Any]:
@@ -77,7 +75,7 @@ def sides(
       stop_asked: asked between images; all take up to half a minute in software.
 
     Raises:
-      Stopped: a stop was asked for.
+      Stopped: `stop_asked` said so.
     """
     views, moments = zip(*evaluation.recorded)
     seconds = environment.step_seconds
@@ -113,6 +111,21 @@ def sides(
     rewards = None if expert.task_rewards is None else expert.task_rewards[0]
     found.append(Side(frames, _captions("expert", len(frames), seconds, rewards)))
     return found
+
+
+def write(path: pathlib.Path, beside: list[Side]) -> None:
+    """Writes sides beside each other, as an mp4 or, at a lower rate, as a GIF.
+
+    Both play at the rate of the first, the agent's, so they stay together: in ten
+    seconds or less, where episodes of the suite last 10 to 25 simulated seconds.
+    """
+    fps = max(15.0, len(beside[0].frames) / 10.0)
+    is_gif = path.suffix == ".gif"
+    stride = round(fps / _GIF_FPS) if is_gif else 1
+    frames = [side.frames[::stride] for side in beside]
+    labels = [side.captions[::stride] for side in beside]
+    write_images = video.write_gif if is_gif else video.write_video
+    write_images(path, *frames, fps=fps / stride, labels=labels)
 
 
 @contextlib.contextmanager

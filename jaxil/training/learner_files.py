@@ -41,7 +41,7 @@ def write(
       folder: absolute.
       learner_state: pytree of arrays, typed PRNG keys and None.
       record: anything that JSON can hold.
-      arrays: further arrays by name, each written to a file NAME.npy.
+      arrays: further ones, each written to a file NAME.npy.
 
     Raises:
       OSError: if a file cannot be written.
@@ -120,16 +120,11 @@ def read(folder: pathlib.Path) -> tuple[dict, dict[str, np.ndarray]]:
 
 
 def as_state(abstract_state: Any, record: dict, arrays: dict[str, np.ndarray]) -> Any:
-    """Returns the learner state that `write` was given.
-
-    Args:
-      abstract_state: pytree of the same structure with the shapes and dtypes of its
-        leaves, from jax.eval_shape.
-      record: see `read`.
-      arrays: see `read`.
+    """Returns the learner state that `write` was given, of what `read` returned.
 
     Raises:
-      OtherLearnerError: names, shapes or dtypes differ.
+      OtherLearnerError: names, shapes or dtypes differ from those of `abstract_state`,
+        a pytree of the same structure from jax.eval_shape.
     """
     expected = dict(_named_leaves(abstract_state))
     faults = [f"{name} is missing" for name in expected if name not in arrays]
@@ -137,8 +132,7 @@ def as_state(abstract_state: Any, record: dict, arrays: dict[str, np.ndarray]) -
     leaves = []
     for name, like in expected.items():
         if name in arrays:
-            key_type = record["leaves"][name]["key_type"]
-            leaf = _as_leaf(arrays[name], key_type)
+            leaf = _as_leaf(arrays[name], record["leaves"][name]["key_type"])
             if _kind(leaf) != _kind(like):
                 faults.append(f"{name} is {_kind(leaf)}, expected {_kind(like)}")
             leaves.append(leaf)

@@ -18,16 +18,12 @@ def plot(
     title: str,
     expert_return: float | None = None,
 ) -> None:
-    """Plots the evaluations of a run, as a PNG.
+    """Plots the evaluations of a run as a PNG, which is replaced atomically.
 
-    Args:
-      path: of the plot, replaced atomically.
-      eval_csv: table with frame, task_return_mean and task_return_std.
-      title: such as the method and the task.
-      expert_return: mean task return of the demonstrations, a dashed line.
+    `expert_return`, the mean of the demonstrations, is a dashed line.
 
     Raises:
-      OSError: if the table cannot be read or the picture cannot be written.
+      OSError: the table cannot be read or the picture cannot be written.
     """
     # Not pyplot: a Figure needs no display and leaves no global state.
     from matplotlib.backends.backend_agg import FigureCanvasAgg

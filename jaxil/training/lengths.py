@@ -16,9 +16,7 @@ _SMALLEST = 8
 def padded_length(num_steps: int, longest: int) -> int:
     """Returns the length to which an episode is padded: 8, 12, 16, 24, 32, 48, ...
 
-    Args:
-      num_steps: T of the episode, >= 1.
-      longest: steps of a whole episode. That length is not padded, nor are longer ones.
+    Whole episodes, of `longest` steps, are not padded, nor are longer ones.
     """
     if num_steps >= longest:
         return num_steps

@@ -107,16 +107,14 @@ class TensorBoard:
     def write_scalars(
         self, group: str, frame: int, values: Mapping[str, float]
     ) -> None:
-        """Writes a row."""
         scalars = _known(group, values).items()
         summary = [{"tag": tag, "simple_value": value} for tag, value in scalars]
         self._write(step=frame, summary={"value": summary})
 
     def write_video(self, frame: int, path: pathlib.Path) -> None:
-        """Does nothing: it shows no mp4."""
+        pass  # it shows no mp4
 
     def close(self) -> None:
-        """Closes the file."""
         self._writer.close()
 
     def _write(self, **fields: Any) -> None:
@@ -160,11 +158,9 @@ class WeightsAndBiases:
     def write_scalars(
         self, group: str, frame: int, values: Mapping[str, float]
     ) -> None:
-        """Logs a row."""
         self._run.log(_known(group, values), step=frame)
 
     def write_video(self, frame: int, path: pathlib.Path) -> None:
-        """Logs a copy of the video."""
         self._run.log({"video": self._video(str(path), format="mp4")}, step=frame)
 
     def close(self) -> None:

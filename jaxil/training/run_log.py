@@ -4,7 +4,7 @@ import contextlib
 import io
 import pathlib
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,11 +12,10 @@ from jaxil import methods
 from jaxil.config import Config
 from jaxil.demonstrations import loading
 from jaxil.errors import MethodError
-from jaxil.files import video
 from jaxil.files.tables import CsvLog
 from jaxil.files.writing import write_atomically
 from jaxil.machine.screen import say
-from jaxil.training import learning_curve, loggers
+from jaxil.training import film, learning_curve, loggers
 from jaxil.training.evaluator import Result
 from jaxil.training.workdir import writes_to
 
@@ -53,6 +52,14 @@ EVAL_COLUMNS = (
 _SATURATED = 3.0
 
 
+class When(NamedTuple):
+    """The first columns of both tables."""
+
+    frame: int
+    seconds: float
+    episode: int  # training episodes so far
+
+
 class RunLog:
     """Owns what a run writes beside its checkpoints.
 
@@ -68,14 +75,10 @@ class RunLog:
         *,
         owes_evaluation: bool = False,
     ) -> None:
-        """Opens the tables and loggers.
+        """Opens the tables and loggers in the run's folder.
 
-        Args:
-          workdir: the run's folder.
-          config: of the run.
-          demonstrations: what the method imitates, or None.
-          resume_frame: on a resume, rows of later frames are dropped.
-          owes_evaluation: whether the evaluation at that frame will be played again.
+        On a resume, rows of frames after `resume_frame` are dropped, and that of an
+        evaluation at that frame if it will be played again.
 
         Raises:
           UsageError: the config's logger does not start.
@@ -105,49 +108,40 @@ class RunLog:
         self._expert_return: float | None = None
         if demonstrations is not None:
             self._expert_return = demonstrations.mean_return()
-        self._last = (0, 0.0)  # frame and seconds of the last row
+        self._last = When(0, 0.0, 0)  # of the last row of an earlier frame
         self._speed = 0.0
 
-    def episode(
-        self, frame: int, seconds: float, episode: int, values: Mapping[str, Any]
-    ) -> None:
+    def episode(self, when: When, values: Mapping[str, Any]) -> None:
         """Logs a training episode; `values` are the columns from `task_return` on."""
-        last_frame, last_seconds = self._last
-        if frame > last_frame:  # else it ended in the same round as the one before
-            self._speed = (frame - last_frame) / max(seconds - last_seconds, 1e-9)
-            self._last = (frame, seconds)
-        row = {"frames_per_second": round(self._speed, 2), **values}
-        self._write_training(frame, seconds, episode, row)
+        frames, seconds = when.frame - self._last.frame, when.seconds
+        if frames > 0:  # else it ended in the same round as the one before
+            self._speed = frames / max(seconds - self._last.seconds, 1e-9)
+            self._last = when
+        self.updates(when, {"frames_per_second": round(self._speed, 2), **values})
 
-    def updates(self, *, frame: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Logs the progress of a method that plays no episodes."""
-        self._write_training(frame, seconds, 0, metrics)
+    def updates(self, when: When, values: Mapping[str, Any]) -> None:
+        """Logs a row of train.csv; of a method that plays no episodes, metrics alone.
 
-    def evaluation(
-        self,
-        result: Result,
-        frame: int,
-        seconds: float,
-        episode: int,
-        *,
-        pre_tanh: float,
-    ) -> str:
+        Raises:
+          MethodError: the method does not declare all of its metrics.
+        """
+        unknown = sorted(set(values) - {*TRAIN_COLUMNS, *self._metrics})
+        if unknown:
+            raise MethodError(
+                f"{self._config.method} returns metrics that it does not declare: "
+                f"{', '.join(unknown)}; name them in METHOD.metrics"
+            )
+        with writes_to(self._workdir):
+            self._write_row("train", when, values)
+
+    def evaluation(self, when: When, result: Result, pre_tanh: float) -> str:
         """Logs an evaluation, with learning curve and video.
 
-        Args:
-          result: what was played, and its video.
-          frame: of the run.
-          seconds: of the run.
-          episode: training episodes so far.
-          pre_tanh: the actor's mean |pre-tanh|; NaN before the first update.
-
-        Returns:
-          A line for the terminal.
+        `pre_tanh` is the actor's mean |pre-tanh|, NaN before the first update. Returns
+        a line for the terminal.
         """
         evaluation = result.evaluation
         row: dict[str, Any] = {
-            "seconds": round(seconds, 3),
-            "episode": episode,
             "task_return_mean": evaluation.mean,
             "task_return_std": evaluation.std,
             "actor_pre_tanh": pre_tanh,
@@ -158,7 +152,7 @@ class RunLog:
             row["wasserstein_to_expert"] = result.distance
         config = self._config
         with writes_to(self._workdir):
-            self._write_scalars("eval", frame, row)
+            self._write_row("eval", when, row)
             learning_curve.plot(
                 self._workdir / "learning_curve.png",
                 self._workdir / "eval.csv",
@@ -166,10 +160,9 @@ class RunLog:
                 expert_return=self._expert_return,
             )
             if result.sides:
-                self._write_video(result, frame)
-        line = (
-            f"frame {frame}: task return {evaluation.mean:.1f} ± {evaluation.std:.1f}"
-        )
+                self._write_video(when.frame, result)
+        mean, std = evaluation.mean, evaluation.std
+        line = f"frame {when.frame}: task return {mean:.1f} ± {std:.1f}"
         if self._expert_return is not None:
             line += f", the expert's {self._expert_return:.1f}"
         if pre_tanh > _SATURATED:
@@ -185,34 +178,20 @@ class RunLog:
             for logger in self._loggers:
                 closing.callback(logger.close)
 
-    def _write_training(
-        self, frame: int, seconds: float, episode: int, values: Mapping[str, Any]
-    ) -> None:
-        unknown = sorted(set(values) - {*TRAIN_COLUMNS, *self._metrics})
-        if unknown:
-            raise MethodError(
-                f"{self._config.method} returns metrics that it does not declare: "
-                f"{', '.join(unknown)}; name them in METHOD.metrics"
-            )
-        row = {"seconds": round(seconds, 3), "episode": episode, **values}
-        with writes_to(self._workdir):
-            self._write_scalars("train", frame, row)
-
-    def _write_scalars(self, group: str, frame: int, row: Mapping[str, Any]) -> None:
-        self._tables[group].append({"frame": frame, **row})
+    def _write_row(self, group: str, when: When, values: Mapping[str, Any]) -> None:
+        row = {"seconds": round(when.seconds, 3), "episode": when.episode, **values}
+        self._tables[group].append({"frame": when.frame, **row})
         for logger in self._loggers:
-            logger.write_scalars(group, frame, row)
+            logger.write_scalars(group, when.frame, row)
 
-    def _write_video(self, result: Result, frame: int) -> None:
+    def _write_video(self, frame: int, result: Result) -> None:
         folder = self._workdir / "videos"
         folder.mkdir(exist_ok=True)
         packed = io.BytesIO()
         np.savez_compressed(packed, **result.filmed)  # pyright: ignore[reportArgumentType]
         write_atomically(folder / f"frame_{frame:09d}.npz", packed.getvalue())
-        frames, captions = zip(*result.sides)
         path = folder / f"frame_{frame:09d}.mp4"
-        fps = frames_per_second(len(frames[0]))
-        video.write_video(path, *frames, fps=fps, labels=captions)
+        film.write(path, result.sides)
         for logger in self._loggers:
             logger.write_video(frame, path)
 
@@ -220,12 +199,3 @@ class RunLog:
 def as_floats(metrics: Mapping[str, Any]) -> dict[str, float]:
     """Returns metrics as numbers, fetched from the device."""
     return {name: float(value) for name, value in metrics.items()}
-
-
-def frames_per_second(num_images: int) -> float:
-    """Returns the frame rate at which an episode plays in ten seconds or less.
-
-    Suite episodes last 10 to 25 simulated seconds. Both halves of a video play at the
-    rate of the agent's, so they stay together.
-    """
-    return max(15.0, num_images / 10.0)

@@ -1,8 +1,8 @@
 """Measures what a run spends its time on."""
 
+import contextlib
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Iterator
 
 from jaxil.environments.player import Environments
 
@@ -14,25 +14,23 @@ class Stopwatch:
         self.seconds: dict[str, float] = {"environment": 0.0, "update": 0.0}
         self.reward_seconds = 0.0  # part of "update"
 
-    def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Returns `function`, whose time is added to the activity `name`."""
-
-        def call(*args: Any, **kwargs: Any) -> Any:
-            start = time.perf_counter()
-            try:
-                return function(*args, **kwargs)
-            finally:
-                self.seconds[name] += time.perf_counter() - start
-
-        return call
+    @contextlib.contextmanager
+    def timed(self, activity: str) -> Iterator[None]:
+        """Adds the time of a block, or of a function that it decorates."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[activity] += time.perf_counter() - start
 
 
 class TimedEnvironments:
     """Environments whose calls, waiting included, count as "environment"."""
 
     def __init__(self, environments: Environments, stopwatch: Stopwatch) -> None:
+        timed = stopwatch.timed("environment")
         self.size = environments.size
-        self.reset = stopwatch.timed("environment", environments.reset)
-        self.step = stopwatch.timed("environment", environments.step)
-        self.receive = stopwatch.timed("environment", environments.receive)
+        self.reset = timed(environments.reset)
+        self.step = timed(environments.step)
+        self.receive = timed(environments.receive)
         self.close = environments.close

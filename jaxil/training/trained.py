@@ -101,11 +101,8 @@ class Policy:
 def load_policy(folder: str | os.PathLike) -> Policy:
     """Returns the policy of a run's newest whole checkpoint.
 
-    The run may still be running. Neither its demonstrations nor the simulator are
-    needed.
-
-    Args:
-      folder: `--workdir` of the run.
+    The run, whose `--workdir` is `folder`, may go on meanwhile. Neither demonstrations
+    nor the simulator are needed.
 
     Raises:
       UsageError: there is no run, no checkpoint, or none can be read.
@@ -147,9 +144,8 @@ def _policy(folder: pathlib.Path, config: Config) -> Policy:
     except CheckpointError as error:
         raise UsageError(str(error)) from error
     if config.encoder.subtract_mean_image and mean is None:
-        raise UsageError(
-            f"{folder}: the checkpoint lacks the mean image that the encoder subtracts"
-        )
+        what = "the mean image that the encoder subtracts"
+        raise UsageError(f"{folder}: the checkpoint lacks {what}")
     head = params["actor"]["params"]["head"]
     (action_dim,) = head["output"]["bias"].shape
     networks = agents.make_networks(config, action_dim, 0.5 if mean is None else mean)

@@ -11,7 +11,7 @@ from jaxil.config import Config
 from jaxil.demonstrations import loading, sampling
 from jaxil.learner.gathering import Frames
 from jaxil.learner.state import TrainState
-from jaxil.maths.types import Batch, ExpertBatch, ExpertEpisodes, Metrics
+from jaxil.maths.types import Batch, Data, ExpertBatch, ExpertEpisodes, Metrics
 from jaxil.replay.device_copy import DeviceCopy
 from jaxil.replay.replay import Replay
 from jaxil.training.agent import Agent, stack_size
@@ -37,31 +37,21 @@ class Updates:
         demonstrations: loading.Demonstrations | None,
         experts: ExpertEpisodes | None,
     ) -> None:
-        """Copies the frames to the device if `replay_on_device` is set.
+        """Takes the demonstrations and, for methods that match episodes, `experts`.
 
-        Args:
-          config: checked.
-          agent: the compiled steps.
-          replay: already filled when a run is resumed.
-          demonstrations: what the method imitates, or None.
-          experts: the same on the device, for methods that match whole episodes.
+        The replay must be filled already when a run is resumed.
         """
-        self._config = config
-        self._agent = agent
-        self._replay = replay
-        self._demonstrations = demonstrations
-        self._experts = experts
+        self._config, self._agent, self._replay = config, agent, replay
+        self._demonstrations, self._experts = demonstrations, experts
         self._pending: list[Sampled] = []
         self._plays = methods.get(config.method).plays
-        self._device_copy: DeviceCopy | None = None
-        self._expert_frames: jax.Array | None = None
-        if config.replay_on_device:
-            if self._plays:
-                self._device_copy = DeviceCopy(replay)
-            if experts is not None:
-                self._expert_frames = experts.frames  # no second copy
-            elif demonstrations is not None and agent.rewarder.expert_batch_size:
-                self._expert_frames = jnp.asarray(demonstrations.frames)
+        on_device = config.replay_on_device
+        self._device_copy = DeviceCopy(replay) if on_device and self._plays else None
+        self._expert_frames: Data | None = None
+        if on_device and experts is not None:
+            self._expert_frames = experts.frames  # no second copy
+        elif on_device and demonstrations and agent.rewarder.expert_batch_size:
+            self._expert_frames = jnp.asarray(demonstrations.frames)
 
     @property
     def is_pending(self) -> bool:
@@ -77,10 +67,7 @@ class Updates:
         return len(self._pending) >= self._config.updates_per_dispatch
 
     def run(self, state: TrainState) -> tuple[TrainState, Metrics | None]:
-        """Runs the collected updates.
-
-        Args:
-          state: donated.
+        """Runs the collected updates on `state`, which is donated.
 
         Returns:
           The state after them, and the last one's metrics; None if there were none.
@@ -106,9 +93,7 @@ class Updates:
     ) -> None:
         """Recomputes the rewards of all stored episodes with the current rewarder.
 
-        Args:
-          state: read; not donated.
-          require_finite: called with rewards before they replace others.
+        `require_finite` is called with rewards before they replace others.
         """
         replay = self._replay
         by_length: dict[int, list[int]] = {}
@@ -156,8 +141,8 @@ class Updates:
         """
         if not self._config.replay_on_device:
             return None
-        copied = self._device_copy
-        return Frames(None if copied is None else copied.frames, self._expert_frames)
+        agent = None if self._device_copy is None else self._device_copy.frames
+        return Frames(agent, self._expert_frames)
 
     def sample(self, rng: np.random.Generator) -> Sampled:
         """Samples what one update learns from."""

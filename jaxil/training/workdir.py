@@ -14,7 +14,7 @@ from jaxil.config import Config
 from jaxil.demonstrations import states
 from jaxil.demonstrations.states import DemonstrationError
 from jaxil.environments import tasks
-from jaxil.errors import Fault, UsageError, printable
+from jaxil.errors import Fault, UsageError, collecting, printable
 from jaxil.files import locking, writing
 from jaxil.files.settings import as_stored, flat
 from jaxil.files.untrusted import read_regular
@@ -33,11 +33,10 @@ class RunFolderError(Exception):
 
 def flag_problems(values: Any) -> Sequence[Fault | str]:
     """Returns why the flag `--workdir` names no folder; nothing if it does."""
-    try:
+    faults: list[str | Fault] = []
+    with collecting(faults):
         from_flag(values.workdir)
-    except UsageError as error:
-        return error.faults
-    return ()
+    return faults
 
 
 def from_flag(value: str | None) -> pathlib.Path:
@@ -53,9 +52,8 @@ def from_flag(value: str | None) -> pathlib.Path:
     try:
         value.encode()
     except UnicodeEncodeError as error:
-        raise UsageError(
-            f"--workdir={value!r} is not UTF-8; choose a name that is"
-        ) from error
+        message = f"--workdir={value!r} is not UTF-8; choose a name that is"
+        raise UsageError(message) from error
     if why := writing.wrong_name(value):
         raise UsageError(f"--workdir has {why}; choose another")
     return pathlib.Path(value)
@@ -96,11 +94,9 @@ def _place_problems(workdir: pathlib.Path) -> list[Fault]:
 
 
 def problems(workdir: pathlib.Path, config: Config) -> list[Fault]:
-    """Returns every reason why a run cannot use a folder.
+    """Returns every reason why a run of a config cannot use a folder.
 
-    Args:
-      workdir: need not exist; it is not created.
-      config: must match the run that is already in the folder, if there is one.
+    It need not exist, and is not created.
     """
     if faults := _place_problems(workdir):
         return faults
@@ -122,14 +118,9 @@ def problems(workdir: pathlib.Path, config: Config) -> list[Fault]:
         if demonstrations_digest(config) not in (stored, None):
             different.append(f"{_SOURCE}: its content has changed since")
     if different:
-        return [
-            Fault(
-                "workdir",
-                f"holds a run with other settings ({'; '.join(different)})",
-                "use the same to resume it, or another --workdir",
-                str(workdir),
-            )
-        ]
+        rule = f"holds a run with other settings ({'; '.join(different)})"
+        way_out = "use the same to resume it, or another --workdir"
+        return [Fault("workdir", rule, way_out, str(workdir))]
     return []
 
 
@@ -165,8 +156,7 @@ def opened(workdir: pathlib.Path) -> Iterator[None]:
 def writes_to(workdir: pathlib.Path) -> Iterator[None]:
     """Turns an OSError of the block, which writes a run's files, into a RunFolderError.
 
-    Raises:
-      RunFolderError: names the fault, the newest checkpoint and what to do.
+    That names the fault, the newest checkpoint and what to do.
     """
     try:
         yield
@@ -203,14 +193,10 @@ def read_config(workdir: pathlib.Path, *, imports_task: bool = True) -> Config:
     Fields that are newer than the run have their defaults, which are how older versions
     behaved. Fields that no longer exist are left out.
 
-    Args:
-      workdir: the folder.
-      imports_task: whether the task's code will be imported, so that the user must
-        have named it unless it is jaxil's.
-
     Raises:
       UsageError: there is no config, it cannot be read, or it names code that the user
-        has not (see `outside.require_trusted`).
+        has not (see `outside.require_trusted`): a method, or a task, whose code matters
+        only if `imports_task`.
     """
     path = workdir / "config.json"
     try:

@@ -1,5 +1,6 @@
 """A drawing that moves with the actions: nothing is simulated. And its agents."""
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -104,4 +105,5 @@ def make_agent(method):
     environment: Any = Drawing()
     agent = REAL_MAKE_AGENT(make_config(method), environment, make_demonstrations())
     start = agent.init_state()
-    return agent._replace(init_state=lambda: jax.tree.map(jnp.copy, start))
+    init_state = functools.partial(jax.tree.map, jnp.copy, start)
+    return dataclasses.replace(agent, init_state=init_state)

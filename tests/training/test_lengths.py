@@ -124,7 +124,7 @@ def test_comparisons_of_whole_episodes_do_not_see_the_padding(method, settings):
     assert rewards.shape == (9,)
     assert np.ptp(rewards) > 0
     np.testing.assert_allclose(rewards, expected, rtol=1e-4, atol=1e-6)
-    if agent.plan is not None:
+    if agent.rewarder.plan is not None:
         plan, index = agent.plan(observed, state.params, episode, experts)
         expected = without_padding(agent, "plan", state, episode, experts)
         assert plan.shape == (10, STEPS + 1)

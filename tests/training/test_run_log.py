@@ -48,7 +48,7 @@ def write_episode(outputs, frame=1000, metrics=None):
         "reward_seconds": 0.0,
         **(metrics or {"critic/loss": 0.25, "actor/pre_tanh": 4.0}),
     }
-    outputs.episode(frame, frame / 100, 0, row)
+    outputs.episode(run_log.When(frame, frame / 100, 0), row)
 
 
 def test_a_metric_that_the_method_does_not_declare_is_named(make_outputs, tmp_path):
@@ -64,13 +64,14 @@ _SIDE = film.Side(np.zeros((2, 24, 24, 3), np.uint8), ["", ""])
 def write_evaluation(outputs, frame=1000, sides=()):
     evaluation = Evaluation([], np.array([10.0, 30.0]), [])
     result = Result(evaluation, distance=0.5, sides=list(sides), filmed={})
-    return outputs.evaluation(result, frame, 20.0, 1, pre_tanh=4.0)
+    return outputs.evaluation(run_log.When(frame, 20.0, 1), result, pre_tanh=4.0)
 
 
 def test_tables_events_and_curve(make_outputs, tmp_path):
     outputs = make_outputs(tmp_path)
     write_episode(outputs)
-    outputs.updates(frame=1000, seconds=11.0, metrics={"actor/loss": float("nan")})
+    when = run_log.When(frame=1000, seconds=11.0, episode=0)
+    outputs.updates(when, {"actor/loss": float("nan")})
     line = write_evaluation(outputs)
 
     assert line.startswith("frame 1000: task return 20.0 ± 10.0; the actor saturates")

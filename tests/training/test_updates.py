@@ -4,6 +4,7 @@ The environment is a drawing that moves with the actions, so that nothing is sim
 Most of the time goes into compiling: a minute of a core.
 """
 
+import dataclasses
 import types
 from typing import Any
 
@@ -45,7 +46,7 @@ def _nothing_is_simulated(monkeypatch):
 def make_run(folder, method="dac", **changes):
     folder.mkdir(exist_ok=True)
     config = make_config(method, **changes)
-    return train.Run.make(config, folder, make_demonstrations(), print)
+    return train.Run.make(config, folder, make_demonstrations())
 
 
 def test_what_was_opened_is_closed_if_the_rest_fails(tmp_path, monkeypatch):
@@ -246,7 +247,8 @@ def test_refreshed_rewards_are_those_of_now(tmp_path):
 def test_a_recomputed_reward_that_is_not_finite_stops_the_run(tmp_path):
     run = make_run(tmp_path, "pdac", reward_refresh_steps=1, update_every_steps=3)
     recomputed = np.full((8, STEPS), np.inf, np.float32)
-    run.agent = run.updates._agent = run.agent._replace(refresh=lambda *_: recomputed)
+    agent = dataclasses.replace(run.agent, refresh=lambda *_: recomputed)
+    run.agent = run.updates._agent = agent
     with pytest.raises(TrainingDiverged, match="recomputed reward became infinite"):
         run.loop()
     run.close()
