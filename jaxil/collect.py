@@ -28,6 +28,7 @@ import os
 import pathlib
 import sys
 from collections.abc import Iterator
+from typing import Any
 
 from absl import flags
 
@@ -53,15 +54,12 @@ def main(argv: list[str]) -> None:
     from jaxil.machine import startup
 
     print(startup.prepare(), file=sys.stderr, flush=True)
-    jobs = {
-        "workdirs": _record,
-        "policy": _record_policy,
-        "inspect": _inspect,
-        "convert": _convert,
-    }
-    for name, do in jobs.items():
-        if values[name].value:
-            do(values)
+    if values.inspect:
+        _inspect(values)
+    elif values.convert:
+        _convert(values)
+    else:
+        _record(values)
 
 
 def _problems(values: flags.FlagValues) -> list[str]:
@@ -94,22 +92,14 @@ def _problems(values: flags.FlagValues) -> list[str]:
 def _record(values: flags.FlagValues) -> None:
     from jaxil import record
 
-    folders = [pathlib.Path(folder) for folder in values.workdirs]
     output = pathlib.Path(values.output)
-    record.best_of_runs(folders, output, num_episodes=values.num_episodes)
-
-
-def _record_policy(values: flags.FlagValues) -> None:
-    from jaxil import record
-
-    record.policy(
-        values.policy,
-        pathlib.Path(values.output),
-        task=values.task,
-        action_repeat=values.action_repeat,
-        image_size=values.image_size,
-        num_episodes=values.num_episodes,
-    )
+    if values.workdirs:
+        folders = [pathlib.Path(folder) for folder in values.workdirs]
+        record.best_of_runs(folders, output, num_episodes=values.num_episodes)
+        return
+    names = ("task", "action_repeat", "image_size", "num_episodes")
+    settings: Any = {name: values[name].value for name in names}
+    record.policy(values.policy, output, **settings)
 
 
 def _inspect(values: flags.FlagValues) -> None:

@@ -20,7 +20,7 @@ from absl import flags
 from jaxil import config as jaxil_config
 from jaxil import declarations, methods, outside, presets
 from jaxil.config import Config
-from jaxil.errors import Fault, RunFailed, UsageError, raised, unknown_name
+from jaxil.errors import Fault, RunFailed, UsageError, collecting, raised, unknown_name
 from jaxil.files.settings import flat
 
 Define = Callable[[flags.FlagValues], None]
@@ -34,11 +34,8 @@ def parse(
 ) -> flags.FlagValues:
     """Reads the command line, collecting every fault before it gives up.
 
-    Args:
-      argv: as in `sys.argv`.
-      description: what `--help` says first.
-      define: adds the command's flags; see `define_config`.
-      check: returns the faults of their values.
+    `define` adds the command's flags, see `define_config`; `check` returns the faults
+    of their values. `--help` begins with the description.
 
     Raises:
       UsageError: names all flags and config fields that are wrong.
@@ -100,11 +97,7 @@ def read_config(words: Iterable[str]) -> Config:
 
 
 def run(main: Callable[[list[str]], int | None]) -> None:
-    """Runs a command and turns its outcome into an exit status.
-
-    Args:
-      main: takes `sys.argv`; returns the status, None for 0.
-    """
+    """Runs a command with `sys.argv` and ends with its exit status, None being 0."""
     if isinstance(sys.stdout, io.TextIOWrapper):  # paths need not be UTF-8
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
@@ -195,9 +188,8 @@ def _field_help(name: str, field: methods.Field) -> str:
     if field.choices:
         limits = f"; one of {', '.join(field.choices)}"
     elif field.low is not None and field.high is not None:
-        limits = (
-            f"; {'above ' if field.positive else ''}{field.low:g} to {field.high:g}"
-        )
+        above = "above " if field.positive else ""
+        limits = f"; {above}{field.low:g} to {field.high:g}"
     elif field.low is not None:
         limits = f"; {'above' if field.positive else 'at least'} {field.low:g}"
     elif field.high is not None:
@@ -220,16 +212,14 @@ def _load(
         for word in words
         if word not in files
     }
-    try:
+    with collecting(faults):
         config = _config_of_file(value)
         if "method" in overrides:
             _change_method(config, overrides["method"])
-    except UsageError as error:
-        faults.extend(error.faults)
-        return None
-    for field, text in overrides.items():
-        faults.extend(_override(config, field, text))
-    return config.lock()
+        for field, text in overrides.items():
+            faults.extend(_override(config, field, text))
+        return config.lock()
+    return None
 
 
 def _config_of_file(value: str) -> Config:
@@ -240,14 +230,9 @@ def _config_of_file(value: str) -> Config:
     if path.suffix != ".py" and not is_file:
         return presets.get_config(name, argument if colon else None).unlock()
     if not is_file:
-        raise UsageError(
-            Fault(
-                "--config",
-                f"names no file: there is no file {name!r} here",
-                "a preset needs none: METHOD:TASK, such as --config=pdac:walker_walk",
-                value,
-            )
-        )
+        rule = f"names no file: there is no file {name!r} here"
+        way_out = "a preset needs none: METHOD:TASK, such as --config=pdac:walker_walk"
+        raise UsageError(Fault("--config", rule, way_out, value))
     own_name = f"preset_{path.stem}"  # the file may be called json.py
     spec = importlib.util.spec_from_loader(
         own_name, importlib.machinery.SourceFileLoader(own_name, str(path))
@@ -261,9 +246,8 @@ def _config_of_file(value: str) -> Config:
     except UsageError:
         raise
     except (Exception, SystemExit) as error:  # whatever the user's file raises
-        raise UsageError(
-            Fault("--config", f"cannot be loaded: {raised(error)}", value=value)
-        ) from error
+        rule = f"cannot be loaded: {raised(error)}"
+        raise UsageError(Fault("--config", rule, value=value)) from error
     if not isinstance(config, ml_collections.ConfigDict):
         rule = "has a get_config() that does not return a ConfigDict"
         raise UsageError(Fault("--config", rule, value=value))
@@ -271,7 +255,12 @@ def _config_of_file(value: str) -> Config:
     method = there.get("method", "pdac")
     is_text = isinstance(method, str)
     fields = jaxil_config.fields(method) if is_text else jaxil_config.FIELDS
-    if wrong := declarations.type_problems(fields, there):
+    checked = (
+        declarations.type_problem(name, field, there[name])
+        for name, field in fields.items()
+        if name in there
+    )
+    if wrong := [fault for fault in checked if fault is not None]:
         raise UsageError(wrong)
     known = tuple(fields)
     lacking = [name for name in known if name not in there]

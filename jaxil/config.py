@@ -90,11 +90,7 @@ FIELDS: dict[str, Field] = {
     "feature_dim": Field(50, "width of the trunks; 50 in the paper", 1, 10**5),
     "hidden_dim": Field(1024, "of actor and critic; 1024 in the paper", 1, 10**5),
     "critic_target_tau": Field(
-        0.01,
-        "update rate of the target critic; 0.01 in DrQ-v2",
-        0,
-        1,
-        positive=True,
+        0.01, "update rate of the target critic; 0.01 in DrQ-v2", 0, 1, positive=True
     ),
     "policy_tau": Field(
         1.0,
@@ -251,12 +247,7 @@ def sees_actions(config: Config) -> bool:
 
 
 def problems(config: Config, known_tasks: tuple[str, ...]) -> list[Fault]:
-    """Checks every field.
-
-    Args:
-      config: as `default_config` makes it, with changes.
-      known_tasks: of the control suite; those of other kinds are not checked here.
-    """
+    """Checks every field; of tasks, only those of the control suite."""
     if not isinstance(config.method, str):  # a ConfigDict takes None for any type
         return list(_problems(config, FIELDS, known_tasks))
     try:
@@ -292,13 +283,9 @@ def _problems(
         value, repeat = read(config, name), config.action_repeat
         if not {name, "action_repeat"} & bad and value % repeat:
             nearest = max(round(value / repeat), 1) * repeat
-            yield Fault(
-                name,
-                f"is not a multiple of action_repeat={repeat}, so it ends inside an "
-                "agent step",
-                f"use {nearest}",
-                value,
-            )
+            rule = f"is not a multiple of action_repeat={repeat}"
+            why = "so it ends inside an agent step"
+            yield Fault(name, f"{rule}, {why}", f"use {nearest}", value)
     for name, field in known.items():
         limit = field.at_most
         if limit and not {name, limit} & bad:
@@ -307,12 +294,8 @@ def _problems(
                 rule = f"is above {limit}={most}"
                 yield Fault(name, rule, f"use at most {most}", value)
     if config.observation == "state" and config.encoder.subtract_mean_image:
-        yield Fault(
-            "encoder.subtract_mean_image",
-            "needs observation='pixels', since a state vector has no mean image",
-            "set it to False",
-            True,
-        )
+        rule = "needs observation='pixels', since a state vector has no mean image"
+        yield Fault("encoder.subtract_mean_image", rule, "set it to False", True)
     if not any(name.startswith("encoder.") for name in bad):
         yield from _encoder_problems(config)
 
@@ -322,11 +305,9 @@ def _encoder_problems(config: Config) -> Iterator[Fault]:
     layers = {name: settings[name] for name in ("channels", "kernel_sizes", "strides")}
     lengths = {name: len(values) for name, values in layers.items()}
     if len(set(lengths.values())) != 1:
-        yield Fault(
-            "encoder",
-            f"has lists whose lengths differ ({lengths})",
-            "give channels, kernel_sizes and strides one entry per layer",
-        )
+        rule = f"has lists whose lengths differ ({lengths})"
+        way_out = "give channels, kernel_sizes and strides one entry per layer"
+        yield Fault("encoder", rule, way_out)
         return
     for name, values in layers.items():
         if not values or any(not isinstance(v, int) or v < 1 for v in values):
@@ -336,15 +317,10 @@ def _encoder_problems(config: Config) -> Iterator[Fault]:
     if config.observation != "pixels":
         return
     # Backwards through the layers: each needs (side - 1) * stride + kernel pixels.
-    smallest = 1
-    for size, stride in zip(
-        reversed(settings.kernel_sizes), reversed(settings.strides), strict=True
-    ):
-        smallest = (smallest - 1) * stride + size
+    smallest, sizes = 1, (settings.kernel_sizes, settings.strides)
+    for kernel, stride in zip(*map(reversed, sizes), strict=True):
+        smallest = (smallest - 1) * stride + kernel
     if config.image_size < smallest:
-        yield Fault(
-            "image_size",
-            "is too small for the encoder, whose convolutions leave nothing",
-            f"use at least {smallest}",
-            config.image_size,
-        )
+        rule = "is too small for the encoder, whose convolutions leave nothing"
+        way_out = f"use at least {smallest}"
+        yield Fault("image_size", rule, way_out, config.image_size)

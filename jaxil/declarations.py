@@ -136,18 +136,6 @@ def field_problems(name: str, field: Field, value: Any) -> Iterator[Fault]:
             yield Fault(name, f"must lie in {interval}", field.about, value)
 
 
-def type_problems(
-    fields: Mapping[str, Field], values: Mapping[str, Any]
-) -> list[Fault]:
-    """Returns why values, by field, cannot stand where the defaults do."""
-    found = [
-        type_problem(name, field, values[name])
-        for name, field in fields.items()
-        if name in values
-    ]
-    return list(filter(None, found))
-
-
 def type_problem(name: str, field: Field, value: Any) -> Fault | None:
     """Returns why a value cannot stand where a field's default does."""
     kind = type(field.default)

@@ -130,9 +130,8 @@ def known() -> dict[str, Method]:
 def get(name: str) -> Method:
     """Returns a method; imports its module if its declaration needs that.
 
-    Args:
-      name: a key of `known()`, or "package.module:METHOD". If it comes from a file and
-        not from the user, see `is_trusted` first.
+    A name is a key of `known()`, or "package.module:METHOD". If it comes from a file
+    and not from the user, see `is_trusted` first.
 
     Raises:
       UsageError: there is no such method.
@@ -140,9 +139,8 @@ def get(name: str) -> Method:
     reference = _references().get(name)
     outside.trust(name)
     if reference is None and ":" not in name:
-        raise UsageError(
-            unknown_name("method", name, (*known(), "package.module:METHOD"))
-        )
+        choices = (*known(), "package.module:METHOD")
+        raise UsageError(unknown_name("method", name, choices))
     return _declaration(reference or name)._replace(name=name)
 
 
@@ -194,14 +192,9 @@ def _declaration(reference: str) -> Method:
     module, _, name = reference.partition(":")
     spec = outside.spec_of(module)
     if spec is None or not spec.origin or not spec.origin.endswith(".py"):
-        raise UsageError(
-            Fault(
-                "method",
-                f"names no module {module!r} that Python finds",
-                "install its package, or add its folder to PYTHONPATH",
-                value=reference,
-            )
-        )
+        rule = f"names no module {module!r} that Python finds"
+        way_out = "install its package, or add its folder to PYTHONPATH"
+        raise UsageError(Fault("method", rule, way_out, reference))
     method: Any = None
     try:
         expression = _assignment(pathlib.Path(spec.origin), name or "METHOD")
@@ -212,20 +205,14 @@ def _declaration(reference: str) -> Method:
         if method is None:
             method = getattr(importlib.import_module(module), name or "METHOD", None)
     except (Exception, SystemExit) as error:  # whatever is wrong with the file
-        raise UsageError(
-            Fault("method", f"cannot be loaded: {raised(error)}", value=reference)
-        ) from error
-    if not isinstance(method, Method):
-        raise UsageError(
-            Fault(
-                "method",
-                f"is not declared: {module!r} has no `{name} = methods.Method(...)`",
-                value=reference,
-            )
-        )
-    faults = [*declarations.problems(method)]
-    if faults:
-        raise UsageError([Fault("method", fault, value=reference) for fault in faults])
+        rule = f"cannot be loaded: {raised(error)}"
+        raise UsageError(Fault("method", rule, value=reference)) from error
+    if isinstance(method, Method):
+        rules = [*declarations.problems(method)]
+    else:
+        rules = [f"is not declared: {module!r} has no `{name} = methods.Method(...)`"]
+    if rules:
+        raise UsageError([Fault("method", rule, value=reference) for rule in rules])
     return method
 
 

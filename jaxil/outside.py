@@ -17,11 +17,9 @@ _trusted: set[str] = set()
 
 
 def load(reference: str, subject: str) -> Any:
-    """Imports a module and returns the attribute that the reference names.
+    """Imports what a user's reference, "package.module:name", names.
 
-    Args:
-      reference: "package.module:name", from the user.
-      subject: the field or flag that holds it, for messages.
+    Messages call it `subject`, the field or flag that holds it.
 
     Raises:
       UsageError: there is no such module or name, or importing it fails.
@@ -30,21 +28,17 @@ def load(reference: str, subject: str) -> Any:
     try:
         return getattr(importlib.import_module(module), name)
     except (Exception, SystemExit) as error:  # whatever the user's file raises
-        raise UsageError(
-            Fault(
-                subject,
-                f"cannot be loaded: {raised(error)}",
-                "write package.module:name, and add the package's folder to PYTHONPATH",
-                reference,
-            )
-        ) from error
+        rule = f"cannot be loaded: {raised(error)}"
+        way_out = "add the package's folder to PYTHONPATH"
+        way_out = f"write package.module:name, and {way_out}"
+        raise UsageError(Fault(subject, rule, way_out, reference)) from error
 
 
 def trust(reference: str) -> None:
     """Notes that the user has named this code, so files may name it too.
 
     Args:
-      reference: "package.module:name" of a method or task, as a run's config has it.
+      reference: of a method or task, as a run's config has it.
     """
     _trusted.add(reference)
 
@@ -69,14 +63,10 @@ def is_trusted(reference: str) -> bool:
 
 
 def require_trusted(references: Mapping[str, str], where: object) -> None:
-    """Refuses code that a file names and the user does not.
-
-    Args:
-      references: "package.module:name" as read from the file, by the field's name.
-      where: the file.
+    """Refuses code that the file `where` names, by its field, and the user does not.
 
     Raises:
-      UsageError: the user has not named all of them in this process.
+      UsageError: the user has not named all of it in this process.
     """
     faults = [
         Fault(

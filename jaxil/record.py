@@ -1,7 +1,7 @@
 """Records demonstrations: of the best of several runs, or of a policy from outside."""
 
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from jaxil.demonstrations import playing
 from jaxil.demonstrations.states import DemonstrationError
 from jaxil.environments import suite, tasks
 from jaxil.environments.evaluation import evaluate
-from jaxil.errors import Fault, UsageError, unknown_name
+from jaxil.errors import Fault, UsageError, collecting, unknown_name
 from jaxil.machine import screen
 from jaxil.training import assembly, trained
 
@@ -30,16 +30,12 @@ def best_of_runs(
     """
     loaded, faults = [], []
     for folder in folders:
-        try:
+        with collecting(faults):
             loaded.append(trained.load(folder))
-        except UsageError as error:
-            faults += error.faults
     names = sorted({policy.config.task for policy, _ in loaded})
     if len(names) > 1:
-        faults.append(
-            f"--workdirs hold runs of different tasks ({', '.join(names)}); list runs "
-            "of one task"
-        )
+        rule = f"hold runs of different tasks ({', '.join(names)})"
+        faults.append(f"--workdirs {rule}; list runs of one task")
     if faults:
         for _, environment in loaded:
             environment.close()
@@ -58,16 +54,10 @@ def best_of_runs(
             flush=True,
         )
     best, _ = loaded[int(np.argmax(means))]
+    expert = f"{best.description()}; mean action, no noise"
+    settings = {name: best.config[name] for name in ("task", "action_repeat")}
     with assembly.environment_with_seed(best.config, _SEED) as environment:
-        _write(
-            output,
-            environment,
-            best,
-            num_episodes=num_episodes,
-            task=best.config.task,
-            action_repeat=best.config.action_repeat,
-            expert=f"{best.description()}; mean action, no noise",
-        )
+        _write(output, environment, best, expert, num_episodes, settings)
 
 
 def policy(
@@ -79,44 +69,27 @@ def policy(
     image_size: int | None,
     num_episodes: int,
 ) -> None:
-    """Records a policy from outside.
+    """Records a policy from outside, the function that `reference` names.
 
-    Args:
-      reference: its package.module:function.
-      output: the file.
-      task: any that jaxil knows.
-      action_repeat: frames of one step.
-      image_size: of the pixels of a task that is not dm_control's.
-      num_episodes: at least 1.
+    `image_size` is that of the pixels of a task that is not dm_control's.
 
     Raises:
       UsageError: policy or task cannot be used, or the file cannot be written.
     """
     faults: list[Fault | str] = []
     act = environment = None
-    try:
+    with collecting(faults):
         act = outside.load(reference, "--policy")
-    except UsageError as error:
-        faults += error.faults
-    try:
+    with collecting(faults):
         environment = _recorded_task(task, action_repeat, image_size)
-    except UsageError as error:
-        faults += error.faults
     if act is None or environment is None:
         if environment is not None:
             environment.close()
         raise UsageError(faults)
+    settings = {"task": task, "action_repeat": action_repeat}
     try:
         with environment:
-            _write(
-                output,
-                environment,
-                act,
-                num_episodes=num_episodes,
-                task=task,
-                action_repeat=action_repeat,
-                expert=reference,
-            )
+            _write(output, environment, act, reference, num_episodes, settings)
     except ValueError as error:
         raise UsageError(f"--policy={reference}: {error}") from error
 
@@ -137,24 +110,21 @@ def _write(
     output: pathlib.Path,
     environment: Any,
     act: Callable[[Any], Any],
-    *,
-    num_episodes: int,
-    task: str,
-    action_repeat: int,
     expert: str,
+    num_episodes: int,
+    settings: Mapping[str, Any],
 ) -> None:
-    """Records episodes and prints what they return."""
+    """Records episodes of an expert and prints what they return."""
     try:
         returns = playing.record(
             output,
             environment,
             act,
             num_episodes=num_episodes,
-            task=task,
-            action_repeat=action_repeat,
             seed=_SEED,
             expert=expert,
             say=screen.say,
+            **settings,
         )
     except (OSError, DemonstrationError) as error:
         raise UsageError(f"--output={output}: {error}") from error

@@ -23,7 +23,7 @@ from typing import Any
 from absl import flags
 
 from jaxil import command
-from jaxil.errors import Fault, UsageError
+from jaxil.errors import Fault, UsageError, collecting
 from jaxil.machine import startup
 from jaxil.reporting import figures
 from jaxil.sweeps import clusters, plan, state, tables
@@ -43,12 +43,11 @@ def main(argv: list[str]) -> int:
     rest = [word for word in words if word not in overrides]
     runs: list[Run] = []
 
-    def check(values: flags.FlagValues) -> Sequence[Fault | str]:
-        try:
+    def check(values: flags.FlagValues) -> list[Fault | str]:
+        faults: list[Fault | str] = []
+        with collecting(faults):
             runs.extend(_checked_runs(values, _cluster(values), overrides))
-        except UsageError as error:
-            return error.faults
-        return ()
+        return faults
 
     values = command.parse([argv[0], *rest], __doc__ or "", _define, check)
     cluster = _cluster(values)
@@ -65,14 +64,9 @@ def main(argv: list[str]) -> int:
     ]
     tables.print_plan(statuses)
     if todo:
-        told = tables.estimate(
-            {run: statuses[run] for run in todo},
-            statuses,
-            num_at_once=clusters.num_at_once(cluster, len(todo)),
-            preset=values.preset,
-            on_gpu=cluster.uses_gpus,
-        )
-        print(told)
+        at_once = clusters.num_at_once(cluster, len(todo))
+        guess = tables.GUESSES[values.preset, "GPU" if cluster.uses_gpus else "CPU"]
+        print(tables.estimate(todo, statuses, num_at_once=at_once, guess=guess))
     else:
         print("Nothing is left to start.")
     if values.dry_run:
@@ -137,11 +131,9 @@ def _checked_runs(
 ) -> list[Run]:
     starts = not (values.dry_run or values.watch)
     faults: list[Fault | str] = [*clusters.problems(cluster, starts=starts)]
-    try:
+    folder = None
+    with collecting(faults):
         folder = workdir.from_flag(values.workdir)
-    except UsageError as error:
-        faults += error.faults
-        folder = None
     pairs = [
         word.lstrip("-").removeprefix("config.").partition("=") for word in overrides
     ]
@@ -157,13 +149,12 @@ def _checked_runs(
     # `prepare` sets variables for this process; runs may be on another machine.
     environment = dict(os.environ)
     startup.prepare()
+    from jaxil.training import assembly
+
     runs = []
     try:
-        from jaxil.training import assembly
-
-        runs = plan.make_runs(request, assembly.problems)
-    except UsageError as error:
-        faults += error.faults
+        with collecting(faults):
+            runs = plan.make_runs(request, assembly.problems)
     finally:
         os.environ.clear()
         os.environ.update(environment)

@@ -117,11 +117,11 @@ def test_cost_by_hand(tmp_path):
         three: Status(State.MISSING),
         other: Status(State.MISSING),
     }
-    todo = {run: statuses[run] for run in (two, three, other)}
+    todo, guess = (two, three, other), tables.GUESSES["tiny", "CPU"]
     # two and three go on at the median 75 frames/s, other at the guess of 40: 80 s,
     # 133 s and 250 s.
-    told = tables.estimate(todo, statuses, num_at_once=9, preset="tiny", on_gpu=False)
+    told = tables.estimate(todo, statuses, num_at_once=9, guess=guess)
     assert told.startswith("Left to do: 26,000 frames, 0.1 hours of runs; about 4 min")
     assert "with 9 at a time (a guess: 40 frames/s for drqv2" in told
-    told = tables.estimate(todo, statuses, num_at_once=1, preset="tiny", on_gpu=False)
+    told = tables.estimate(todo, statuses, num_at_once=1, guess=guess)
     assert "about 8 min with 1" in told

@@ -23,12 +23,10 @@ def names() -> tuple[str, ...]:
 
 
 def get_config(name: str, argument: str | None = None) -> Config:
-    """Returns the settings of a preset.
+    """Returns the settings of a preset, or of a method in a module of one's own.
 
-    Args:
-      name: one of `names()`, or the module of a method of one's own.
-      argument: METHOD,TASK of `tiny`, METHOD or METHOD:TASK of a module, TASK of the
-        others; None for the preset's own default.
+    The argument is METHOD,TASK of `tiny`, METHOD or METHOD:TASK of a module, TASK of
+    the others; None stands for the preset's own default.
 
     Raises:
       UsageError: there is no such preset, or the argument is wrong.

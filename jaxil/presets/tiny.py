@@ -136,14 +136,9 @@ def get_config(argument: str = "pdac,cartpole_swingup"):
     """Returns the preset for `METHOD,TASK`."""
     method, comma, task = argument.partition(",")
     if not comma:
-        raise UsageError(
-            Fault(
-                "--config",
-                "lacks the task",
-                "write METHOD,TASK, such as tiny:pdac,cartpole_swingup",
-                f"tiny:{argument}",
-            )
-        )
+        way_out = "write METHOD,TASK, such as tiny:pdac,cartpole_swingup"
+        given = f"tiny:{argument}"
+        raise UsageError(Fault("--config", "lacks the task", way_out, given))
     config = jaxil_config.default_config(method, task)
     rewarder = method.removesuffix("_cloning")
     config.update(_ALL)

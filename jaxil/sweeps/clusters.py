@@ -63,12 +63,7 @@ class Cluster(NamedTuple):
 
 
 def problems(cluster: Cluster, *, starts: bool) -> Iterator[Fault]:
-    """Yields each reason why a cluster is not available.
-
-    Args:
-      cluster: unchecked.
-      starts: whether runs will be started, or only shown.
-    """
+    """Yields why a cluster cannot do runs, or if not `starts`, cannot show them."""
     if cluster.name not in CLUSTERS:
         yield unknown_name("--cluster", cluster.name, CLUSTERS)
     if starts and cluster.name == "slurm":
@@ -134,13 +129,9 @@ def start(
     folder: pathlib.Path,
     watch: Callable[[], None],
 ) -> None:
-    """Does the runs; on Slurm, only submits them.
+    """Does at least one run of a sweep's folder; on Slurm, only submits them.
 
-    Args:
-      cluster: checked.
-      runs: what is left to do, at least one.
-      folder: of the sweep.
-      watch: called now and then while runs go on here.
+    `watch` is called now and then while runs go on here.
 
     Raises:
       KeyboardInterrupt: the sweep was stopped; by then all runs have saved and ended.
@@ -212,10 +203,8 @@ class Job(Worker):
 def submit(cluster: Cluster, runs: Sequence[Run], logs: pathlib.Path) -> None:
     """Queues one job for each run; a site's further needs go in SBATCH_... variables.
 
-    Args:
-      cluster: checked.
-      runs: at least one; their commands are run in the current folder.
-      logs: folder of what submitit writes; all nodes must see it.
+    Their commands are run in the current folder. All nodes must see the folder `logs`,
+    where submitit writes.
 
     Raises:
       UsageError: Slurm refuses them, for its partition, say.

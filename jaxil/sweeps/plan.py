@@ -45,9 +45,7 @@ def make_runs(
 ) -> list[Run]:
     """Returns all runs: seed 0 of everything first, so that early results compare.
 
-    Args:
-      request: what to run.
-      config_problems: as `jaxil.training.assembly.problems`.
+    `config_problems` is `jaxil.training.assembly.problems`, whose import takes seconds.
 
     Raises:
       UsageError: names every fault of every run, each once.

@@ -74,11 +74,9 @@ class Status(NamedTuple):
 
 
 def status(run: Run, queued: frozenset[str] = frozenset()) -> Status:
-    """Looks at a run; cheap, however long its tables are.
+    """Looks at a run, which need not have begun; cheap, however long its tables are.
 
-    Args:
-      run: need not have begun.
-      queued: the Slurm jobs that wait or run.
+    `queued` are the Slurm jobs that wait or run.
     """
     try:
         training = _last_row(run.folder / "train.csv")

@@ -6,7 +6,7 @@ import shlex
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 from rich import box
 from rich.console import Console
@@ -25,7 +25,7 @@ _PLAIN_WIDTH = 160  # of a table in a file or pipe, which has no width of its ow
 _NUMBERS = ("seed", "frame", "return", "frames/s", "left")
 # Frames per second of one run at a time, where none has been measured. On the CPU, as
 # the README's measurements; on a GPU, of fifteen at once on one H100 (2026-11-27).
-_GUESSES = {
+GUESSES = {
     ("paper", "CPU"): 4.0,
     ("tiny", "CPU"): 40.0,
     ("paper", "GPU"): 220.0,
@@ -51,7 +51,7 @@ def print_plan(statuses: Statuses) -> None:
 
 
 def estimate(
-    todo: Statuses, statuses: Statuses, *, num_at_once: int, preset: str, on_gpu: bool
+    todo: Sequence[Run], statuses: Statuses, *, num_at_once: int, guess: float
 ) -> str:
     """Returns a sentence on what is left to do and how long it takes.
 
@@ -59,16 +59,14 @@ def estimate(
       todo: the runs to be done.
       statuses: of all runs of the sweep, which show how fast it goes.
       num_at_once: runs that go on at a time.
-      preset: see `plan.PRESETS`; it decides where no run has shown its speed.
-      on_gpu: as `preset`.
+      guess: frames per second of methods of which no run has shown its speed.
     """
-    guess = _GUESSES[preset, "GPU" if on_gpu else "CPU"]
     measured: dict[str, list[float]] = {}
     for run, status in statuses.items():
         speed = status.frames_per_second
         if speed is not None and status.seconds >= _ENOUGH_SECONDS:
             measured.setdefault(run.method, []).append(speed)
-    frames = {run: max(run.total_frames - s.frame, 0) for run, s in todo.items()}
+    frames = {run: max(run.total_frames - statuses[run].frame, 0) for run in todo}
     seconds = [
         left / statistics.median(measured.get(run.method, [guess]))
         for run, left in frames.items()
@@ -102,10 +100,9 @@ def counts(statuses: Iterable[Status]) -> str:
 
 
 def watch(look: Callable[[], Statuses]) -> Statuses:
-    """Shows all runs until each has ended; once where the table cannot be redrawn.
+    """Shows the runs that `look` returns until each has ended.
 
-    Args:
-      look: returns the runs as they are now.
+    Where the table cannot be redrawn, they are shown once.
     """
     console = _console()
     statuses = look()
