@@ -84,11 +84,7 @@ def parse(
 
 
 def read_config(words: Iterable[str]) -> Config:
-    """Returns the config of words such as "--config=FILE" and "--config.seed=3".
-
-    Raises:
-      UsageError: as `parse` would.
-    """
+    """Returns the config of words such as "--config=FILE", checked as by `parse`."""
     faults: list[Fault | str] = []
     config = _load(list(words), None, faults)
     if faults:

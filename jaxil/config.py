@@ -216,11 +216,7 @@ def frames_of_updates(config: Config) -> int:
 
 
 def fields(method: str) -> dict[str, Field]:
-    """Returns all fields of a method's config by dotted name, in order.
-
-    Raises:
-      UsageError: there is no such method.
-    """
+    """Returns all fields of a method's config by dotted name, in order."""
     own = {
         f"{section}.{name}": field
         for section, members in methods.get(method).sections.items()

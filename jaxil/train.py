@@ -281,7 +281,7 @@ class Run(Parts):
     def close(self) -> None:
         """Ends the line and the loggers, and closes the environments."""
         with contextlib.ExitStack() as closing:
-            closing.callback(self.evaluator.close)
+            closing.callback(self.evaluator.environment.close)
             if self.player is not None:
                 closing.callback(self.player.close)
             closing.callback(self.log.close)

@@ -69,9 +69,10 @@ class Dummies:
             ),
             experts=None,
             evaluator=_part(
-                environment=_part(action_spec=lambda: _part(shape=(1,))),
+                environment=_part(
+                    action_spec=lambda: _part(shape=(1,)), close=lambda: None
+                ),
                 evaluate=self._evaluate,
-                close=lambda: None,
             ),
             checkpoints=_part(
                 save=lambda **_: self.tape.append("save"), newest=lambda: 4000

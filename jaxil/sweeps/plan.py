@@ -95,8 +95,12 @@ def _request_problems(
     if not 1 <= request.num_seeds <= _MAX_SEEDS:
         rule = f"must lie in [1, {_MAX_SEEDS}]"
         yield Fault("--seeds", rule, value=request.num_seeds)
-    if request.folder is not None:
-        yield from _place_problems(request.folder)
+    folder = request.folder
+    if folder is not None and os.path.exists(folder / "config.json"):
+        rule, way_out = "is the folder of a single run", "name another for the sweep"
+        yield Fault("--workdir", rule, way_out, str(folder))
+    elif folder is not None:
+        yield from workdir.problems(folder, jaxil_config.default_config())
     known = {
         field: None
         for choice in choices
@@ -104,21 +108,13 @@ def _request_problems(
     }
     for field, value in request.overrides.items():
         if any(field in choice.variant.overrides for choice in choices):
-            yield Fault(
-                f"--config.{field}", "is what an ablation varies", "leave it out"
-            )
+            rule = "is what an ablation varies"
+            yield Fault(f"--config.{field}", rule, "leave it out")
         elif field in _OWN_FLAGS:
             rule, way_out = "is what the sweep itself sets", f"use {_OWN_FLAGS[field]}"
             yield Fault(f"--config.{field}", rule, way_out, value)
         elif field not in known and not any(":" in name for name in faulty):
             yield unknown_name("field", field, tuple(known))
-
-
-def _place_problems(folder: pathlib.Path) -> Iterable[Fault]:
-    if os.path.exists(folder / "config.json"):
-        rule, way_out = "is the folder of a single run", "name another for the sweep"
-        return [Fault("--workdir", rule, way_out, str(folder))]
-    return workdir.problems(folder, jaxil_config.default_config())
 
 
 def _method_problems(method: str) -> tuple[Fault, ...]:
@@ -152,11 +148,7 @@ def _choices(request: Request) -> list[_Choice]:
 def _configured(
     request: Request, task: str, choice: _Choice
 ) -> tuple[Config, list[str]]:
-    """Returns the config of a task's variant and the words that make it.
-
-    Raises:
-      UsageError: as `jaxil.launch` would.
-    """
+    """Returns the config of a task's variant, or raises, and the words that make it."""
     method = choice.variant.method
     own = jaxil_config.fields(method).keys() - _OWN_FLAGS.keys()
     given = {name: v for name, v in request.overrides.items() if name in own}

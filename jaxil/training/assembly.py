@@ -1,4 +1,7 @@
-"""From a checked config to a run's environments, replay and demonstrations."""
+"""From a checked config to a run's environments, replay and demonstrations.
+
+What reads demonstrations raises a DemonstrationError where they do not fit the run.
+"""
 
 import functools
 from collections.abc import Callable, Iterator, Mapping
@@ -96,11 +99,8 @@ def task_problems(config: Config, *, checks_length: bool = False) -> list[Fault]
 def demonstration_fault(config: Config) -> str | None:
     """Returns why a run cannot use its demonstrations; None if it can."""
     try:
-        loading.check(
-            config.demonstrations.source,
-            sees_actions=jaxil_config.sees_actions(config),
-            **_file_settings(config),
-        )
+        sees_actions = jaxil_config.sees_actions(config)
+        loading.check(sees_actions=sees_actions, **_file_settings(config))
     except DemonstrationError as error:
         return str(error)
     return None
@@ -185,15 +185,11 @@ def load_demonstrations(config: Config) -> loading.Demonstrations | None:
 
     Rendering them takes minutes at quality `paper` in software, the first time: a
     progress line is shown.
-
-    Raises:
-      DemonstrationError: the file does not fit this run.
     """
     if not jaxil_config.uses_demonstrations(config):
         return None
     with shown("rendering the demonstrations, once") as show:
         return loading.load(
-            config.demonstrations.source,
             render_quality=config.render_quality,
             camera=config.camera,
             distraction=config.demonstrations.distraction,
@@ -205,14 +201,9 @@ def load_demonstrations(config: Config) -> loading.Demonstrations | None:
 def load_shown_expert(
     config: Config, image_size: int, progress: Callable[[int, int], None] | None
 ) -> loading.Demonstrations:
-    """Returns the first demonstration, rendered for people to watch.
-
-    Raises:
-      DemonstrationError: the file does not fit this run.
-    """
+    """Returns the first demonstration, rendered for people to watch."""
     shown_as = {"image_size": image_size, "observation": "pixels", "num_episodes": 1}
     return loading.load(
-        config.demonstrations.source,
         render_quality=config.render_quality,
         camera=config.camera,
         warns=False,  # the run has warned, of the size that the agent sees
@@ -222,31 +213,22 @@ def load_shown_expert(
 
 
 def expert_return(config: Config) -> float | None:
-    """Returns the demonstrations' mean task return; None if unknown.
-
-    Raises:
-      DemonstrationError: the file does not fit this run.
-    """
-    return loading.mean_return(config.demonstrations.source, **_file_settings(config))
+    """Returns the demonstrations' mean task return; None if unknown."""
+    return loading.mean_return(**_file_settings(config))
 
 
 def _file_settings(config: Config) -> dict[str, Any]:
-    """Returns the fields of `loading.Wanted`."""
+    """Returns the source and the fields of `loading.Wanted`."""
     settings = config.demonstrations
     usual = jaxil_config.FIELDS["demonstrations.num_episodes"].default
+    of_agent = ("task", "action_repeat", "max_episode_frames", "image_size")
+    of_file = ("source", "num_episodes", "sampling", "fit", "frame_skip")
     return {
-        "task": config.task,
-        "num_episodes": settings.num_episodes,
+        **{name: config[name] for name in (*of_agent, "observation")},
+        **{name: settings[name] for name in of_file},
         "takes_fewer": bool(settings.source) and settings.num_episodes == usual,
-        "sampling": settings.sampling,
-        "fit": settings.fit,
         "stated_action_repeat": settings.action_repeat,
         "dataset_camera": settings.camera,
-        "action_repeat": config.action_repeat,
-        "max_episode_frames": config.max_episode_frames,
-        "image_size": config.image_size,
-        "observation": config.observation,
-        "frame_skip": settings.frame_skip,
         "max_bytes": memory.spare_bytes(),
     }
 

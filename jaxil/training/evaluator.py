@@ -93,10 +93,6 @@ class Evaluator:
             return None
         return Result(evaluation, distance, sides, filmed)
 
-    def close(self) -> None:
-        """Closes the environment."""
-        self.environment.close()
-
     def explain(self, state: TrainState, episode: Episode) -> dict[str, np.ndarray]:
         """Returns what videos and reports show of an episode.
 

@@ -35,16 +35,13 @@ def write(
     record: dict,
     arrays: dict[str, np.ndarray],
 ) -> None:
-    """Writes a folder, which must not exist.
+    """Writes a folder, whose path is absolute and which must not exist.
 
-    Args:
-      folder: absolute.
-      learner_state: pytree of arrays, typed PRNG keys and None.
-      record: anything that JSON can hold.
-      arrays: further ones, each written to a file NAME.npy.
+    The state is a pytree of arrays, typed PRNG keys and None, the record anything that
+    JSON can hold. Each further array is written to a file NAME.npy.
 
     Raises:
-      OSError: if a file cannot be written.
+      OSError: a file cannot be written.
     """
     import orbax.checkpoint as ocp  # slow to import
 

@@ -15,6 +15,7 @@ from jaxil.config import Config
 from jaxil.errors import Fault, UsageError
 
 _WANDB = "wandb"
+Values = Mapping[str, float]  # by column of train.csv or eval.csv
 
 
 class Logger(Protocol):
@@ -25,15 +26,13 @@ class Logger(Protocol):
     are about to be written again.
     """
 
-    def write_scalars(
-        self, group: str, frame: int, values: Mapping[str, float]
-    ) -> None:
+    def write_scalars(self, group: str, frame: int, values: Values) -> None:
         """Writes one row, which is NaN where nothing is known yet.
 
         Args:
           group: "train", at each episode's end, or "eval".
           frame: environment frames so far; never decreases.
-          values: by column of train.csv or eval.csv.
+          values: by column.
         """
         ...
 
@@ -104,9 +103,7 @@ class TensorBoard:
             start = messages.SessionLog(status=messages.SessionLog.START)
             self._write(step=resume_frame + 1, session_log=start)
 
-    def write_scalars(
-        self, group: str, frame: int, values: Mapping[str, float]
-    ) -> None:
+    def write_scalars(self, group: str, frame: int, values: Values) -> None:
         scalars = _known(group, values).items()
         summary = [{"tag": tag, "simple_value": value} for tag, value in scalars]
         self._write(step=frame, summary={"value": summary})
@@ -155,9 +152,7 @@ class WeightsAndBiases:
                 raise UsageError(Fault("logger", rule, way_out, _WANDB)) from error
         self._video = wandb_api.Video
 
-    def write_scalars(
-        self, group: str, frame: int, values: Mapping[str, float]
-    ) -> None:
+    def write_scalars(self, group: str, frame: int, values: Values) -> None:
         self._run.log(_known(group, values), step=frame)
 
     def write_video(self, frame: int, path: pathlib.Path) -> None:
@@ -168,7 +163,7 @@ class WeightsAndBiases:
         self._run.finish(exit_code=int(sys.exc_info()[0] is not None))
 
 
-def _known(group: str, values: Mapping[str, float]) -> dict[str, float]:
+def _known(group: str, values: Values) -> dict[str, float]:
     """Returns values by GROUP/COLUMN, without metrics that have no value yet."""
     return {
         f"{group}/{column}": float(value)
