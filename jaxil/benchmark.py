@@ -32,7 +32,7 @@ def main(argv: list[str]) -> None:
     from jaxil.machine import startup
 
     print(startup.prepare(), file=sys.stderr, flush=True)
-    from jaxil.timing import measurement, tables
+    from jaxil.timing import measurement, summary
     from jaxil.training import assembly
 
     if faults := assembly.problems(values.config):
@@ -45,18 +45,18 @@ def main(argv: list[str]) -> None:
             print(f"{field}={value}", file=sys.stderr, flush=True)
             found = measurement.measure(config, **settings)
             results.append({"sweep": {"field": field, "value": value}, **found})
-        print(tables.machine_line(results[0]))
-        print(tables.sweep_table(results))
+        print(summary.machine_line(results[0]))
+        print(summary.sweep_table(results))
     else:
-        old = None if values.compare is None else tables.read(values.compare)
+        old = None if values.compare is None else summary.read(values.compare)
         if values.start:
             settings["environment"] = environment
         results = measurement.measure(values.config, **settings)
-        print(tables.results_table(results))
+        print(summary.results_table(results))
         if old is not None:
             print(f"\nagainst {values.compare}")
-            print(tables.comparison_table(old, results))
-            for line in tables.differences(old, results):
+            print(summary.comparison_table(old, results))
+            for line in summary.differences(old, results):
                 print(f"warning: not the same: {line}", file=sys.stderr)
     if values.json is not None:
         from jaxil.files.writing import write_atomically

@@ -26,7 +26,7 @@ from jaxil import command
 from jaxil.errors import Fault, UsageError, collecting
 from jaxil.machine import startup
 from jaxil.reporting import figures
-from jaxil.sweeps import clusters, plan, state, tables
+from jaxil.sweeps import clusters, display, plan, state
 from jaxil.sweeps.state import Run, State, Status
 from jaxil.training import workdir
 
@@ -52,8 +52,8 @@ def main(argv: list[str]) -> int:
     values = command.parse([argv[0], *rest], __doc__ or "", _define, check)
     cluster = _cluster(values)
     if values.watch:
-        statuses = tables.watch(lambda: _look(runs))
-        tables.print_failures(statuses)
+        statuses = display.watch(lambda: _look(runs))
+        display.print_failures(statuses)
         bad = (State.FAILED, State.DAMAGED)
         return int(any(status.state in bad for status in statuses.values()))
     statuses = _look(runs)
@@ -62,11 +62,11 @@ def main(argv: list[str]) -> int:
         for run, status in statuses.items()
         if status.state not in _AWAY and not state.damage(run)
     ]
-    tables.print_plan(statuses)
+    display.print_plan(statuses)
     if todo:
         at_once = clusters.num_at_once(cluster, len(todo))
-        guess = tables.GUESSES[values.preset, "GPU" if cluster.uses_gpus else "CPU"]
-        print(tables.estimate(todo, statuses, num_at_once=at_once, guess=guess))
+        guess = display.GUESSES[values.preset, "GPU" if cluster.uses_gpus else "CPU"]
+        print(display.estimate(todo, statuses, num_at_once=at_once, guess=guess))
     else:
         print("Nothing is left to start.")
     if values.dry_run:
@@ -101,7 +101,7 @@ def _stay(cluster: clusters.Cluster, statuses: Statuses, folder: str) -> int:
 
     def tell() -> None:
         left = [run for run in todo if known[run] is not State.FINISHED]
-        for line in tables.changes(known, {run: state.status(run) for run in left}):
+        for line in display.changes(known, {run: state.status(run) for run in left}):
             print(line, flush=True)
 
     was_interrupted = False
@@ -113,11 +113,11 @@ def _stay(cluster: clusters.Cluster, statuses: Statuses, folder: str) -> int:
         was_interrupted = True
     tell()
     statuses = _look(list(statuses))
-    print(f"\n{tables.counts(statuses.values())}")
+    print(f"\n{display.counts(statuses.values())}")
     if was_interrupted:
         print("stopped; rerun the same command to resume", file=sys.stderr)
         return 130
-    tables.print_failures(statuses)
+    display.print_failures(statuses)
     return int(any(s.state is not State.FINISHED for s in statuses.values()))
 
 

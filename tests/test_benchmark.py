@@ -11,7 +11,7 @@ import pytest
 from jaxil import benchmark, command
 from jaxil import config as jaxil_config
 from jaxil.errors import UsageError
-from jaxil.timing import measurement, start, tables
+from jaxil.timing import measurement, start, summary
 from jaxil.timing.bench import Bench
 from tests.commands import STATES, call, small
 
@@ -48,7 +48,7 @@ def measured(tmp_path_factory):
 
 def test_every_row_is_a_positive_number_and_in_the_table(measured):
     finished, results = measured
-    names = {name for rows in tables.ROWS.values() for name in rows}
+    names = {name for rows in summary.ROWS.values() for name in rows}
     assert {*_NAMES} <= names <= set(results)
     # A CPU has no memory apart from the host's.
     empty = {name for name in names if results[name] is None}
@@ -114,7 +114,7 @@ def test_a_sweep_measures_each_value(monkeypatch, tmp_path, capsys):
         seen.append((config.batch_size, config.seed, settings))
         machine = dict.fromkeys(("num_devices", "usable_cores", "cores"), 1)
         machine |= {"device": "cpu", "processor": "x", "repeats": 1}
-        names = {name for rows in tables.ROWS.values() for name in rows}
+        names = {name for rows in summary.ROWS.values() for name in rows}
         return {**dict.fromkeys(names, 1.0), **machine}
 
     monkeypatch.setattr(measurement, "measure", measure)

@@ -11,7 +11,7 @@ import pytest
 
 from jaxil.files import locking
 from jaxil.files.tables import read_csv
-from jaxil.sweeps import clusters, state, tables
+from jaxil.sweeps import clusters, display, state
 from jaxil.sweeps.clusters import Cluster
 from jaxil.sweeps.state import State
 from tests import commands
@@ -53,8 +53,8 @@ def test_one_failure_stops_nothing_and_is_tried_again_by_the_next_sweep(
     runs = [bad, *(_quick(tmp_path, name) for name in ("one", "two", "three"))]
     assert _start(runs, tmp_path).wait(_SECONDS) == 0
     statuses = {run: state.status(run) for run in runs}
-    assert tables.counts(statuses.values()) == "1 failed, 3 finished"
-    tables.print_failures(statuses)
+    assert display.counts(statuses.values()) == "1 failed, 3 finished"
+    display.print_failures(statuses)
     shown = capsys.readouterr().out
     assert "bad/zero/seed0 failed (exit status 3)" in shown
     assert "the reason of the failure" in shown

@@ -3,7 +3,7 @@
 import pytest
 
 from jaxil.files import locking
-from jaxil.sweeps import clusters, plan, state, tables
+from jaxil.sweeps import clusters, display, plan, state
 from jaxil.sweeps.clusters import Cluster
 from jaxil.sweeps.state import State, Status
 from jaxil.training import workdir
@@ -70,9 +70,9 @@ def test_a_damaged_run_is_shown_and_the_others_go_on(tmp_path, name, content, ca
     (bad.folder / name).write_bytes(content)
     assert make_runs(tmp_path, methods=["pdac"], tasks=["walker_run"]) == [bad, good]
     statuses = {run: state.status(run) for run in (bad, good)}
-    assert tables.counts(statuses.values()) == "1 damaged, 1 missing"
-    tables.print_plan(statuses)
-    tables.watch(lambda: statuses)
+    assert display.counts(statuses.values()) == "1 damaged, 1 missing"
+    display.print_plan(statuses)
+    display.watch(lambda: statuses)
     assert "seed0 is damaged: " in capsys.readouterr().out
     # A table is set aside by the run itself; without settings there is no run.
     assert bool(state.damage(bad)) == (name == "config.json")
@@ -117,11 +117,11 @@ def test_cost_by_hand(tmp_path):
         three: Status(State.MISSING),
         other: Status(State.MISSING),
     }
-    todo, guess = (two, three, other), tables.GUESSES["tiny", "CPU"]
+    todo, guess = (two, three, other), display.GUESSES["tiny", "CPU"]
     # two and three go on at the median 75 frames/s, other at the guess of 40: 80 s,
     # 133 s and 250 s.
-    told = tables.estimate(todo, statuses, num_at_once=9, guess=guess)
+    told = display.estimate(todo, statuses, num_at_once=9, guess=guess)
     assert told.startswith("Left to do: 26,000 frames, 0.1 hours of runs; about 4 min")
     assert "with 9 at a time (a guess: 40 frames/s for drqv2" in told
-    told = tables.estimate(todo, statuses, num_at_once=1, guess=guess)
+    told = display.estimate(todo, statuses, num_at_once=1, guess=guess)
     assert "about 8 min with 1" in told

@@ -44,7 +44,7 @@ def measure(
       full: whether to fill the replay before memory is measured.
 
     Returns:
-      All rows of `tables.ROWS`, None if not applicable; `ranges`, lowest and highest
+      All rows of `summary.ROWS`, None if not applicable; `ranges`, lowest and highest
       by row; the machine; the config.
     """
     with (
