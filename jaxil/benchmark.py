@@ -9,6 +9,7 @@ Times are medians over repeats, after a warm-up. The run is not kept. Compiling 
 a cache and starting a run are timed last, unless --nostart or --sweep is given.
 """
 
+import functools
 import json
 import os
 import pathlib
@@ -20,7 +21,7 @@ from absl import flags
 from jaxil import command
 from jaxil.errors import UsageError, unknown_name
 from jaxil.files.settings import flat
-from jaxil.files.writing import obstacle, wrong_name
+from jaxil.files.writing import obstacle, write_atomically, wrong_name
 
 _EXAMPLE = "such as --sweep=batch_size:64,128,256"
 
@@ -59,8 +60,6 @@ def main(argv: list[str]) -> None:
             for line in summary.differences(old, results):
                 print(f"warning: not the same: {line}", file=sys.stderr)
     if values.json is not None:
-        from jaxil.files.writing import write_atomically
-
         try:
             text = json.dumps(results, indent=2) + "\n"
             write_atomically(values.json, text.encode())
@@ -112,29 +111,22 @@ def _unwritable(path: str) -> str:
 
 
 def _define(values: flags.FlagValues) -> None:
+    text = functools.partial(flags.DEFINE_string, default=None, flag_values=values)
+    yes = functools.partial(flags.DEFINE_boolean, flag_values=values)
+    number = functools.partial(
+        flags.DEFINE_integer, upper_bound=10**6, flag_values=values
+    )
     command.define_config(values)
-    for name, meaning in (
-        ("json", "file for the results"),
-        ("compare", "file of an earlier --json: prints old, new and their ratio"),
-        (
-            "sweep",
-            "FIELD:VALUE,VALUE,...: a config field to vary, such as "
-            "batch_size:64,128; --json then writes a list",
-        ),
-    ):
-        flags.DEFINE_string(name, None, meaning, flag_values=values)
-    for name, default, meaning in (
-        ("start", True, "also time compiling without a cache and starting a run"),
-        ("full", False, "fill the replay before memory is measured"),
-    ):
-        flags.DEFINE_boolean(name, default, meaning, flag_values=values)
-    for name, default, lowest, meaning in (
-        ("repeats", 10, 1, "timings of each part; ten times as many of the short ones"),
-        ("steps", 40, 2, "agent steps to time of the loop, with and without overlap"),
-    ):
-        flags.DEFINE_integer(
-            name, default, meaning, lowest, upper_bound=10**6, flag_values=values
-        )
+    text("json", help="file for the results")
+    text("compare", help="file of an earlier --json: prints old, new and their ratio")
+    field = "a config field to vary, such as batch_size:64,128"
+    text("sweep", help=f"FIELD:VALUE,VALUE,...: {field}; --json then writes a list")
+    yes("start", True, "also time compiling without a cache and starting a run")
+    yes("full", False, "fill the replay before memory is measured")
+    repeats = "timings of each part; ten times as many of the short ones"
+    number("repeats", 10, repeats, lower_bound=1)
+    steps = "agent steps to time of the loop, with and without overlap"
+    number("steps", 40, steps, lower_bound=2)
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ from absl import flags
 from jaxil import command
 from jaxil.config import FIELDS
 from jaxil.errors import UsageError
-from jaxil.files.writing import obstacle, wrong_name
+from jaxil.files.writing import obstacle, replacing, wrong_name
 
 _INSPECTED_SIZE, _CONVERTED_SIZE = 160, 84  # of images rendered from states
 # What each job reads; all but --inspect need an output.
@@ -105,7 +105,6 @@ def _record(values: flags.FlagValues) -> None:
 def _inspect(values: flags.FlagValues) -> None:
     from jaxil.demonstrations import inspection, states
     from jaxil.files.video import write_video
-    from jaxil.files.writing import replacing
     from jaxil.machine import memory
     from jaxil.machine.progress import shown
 

@@ -14,7 +14,7 @@ import ml_collections
 from jaxil import declarations, methods, outside
 from jaxil.declarations import Field
 from jaxil.demonstrations.settings import DEMONSTRATIONS
-from jaxil.errors import Fault, UsageError, unknown_name
+from jaxil.errors import Fault, UsageError, collecting, unknown_name
 
 # An ml_collections.ConfigDict, whose fields no type checker can know.
 Config = Any
@@ -244,20 +244,17 @@ def sees_actions(config: Config) -> bool:
 
 def problems(config: Config, known_tasks: tuple[str, ...]) -> list[Fault]:
     """Checks every field; of tasks, only those of the control suite."""
-    if not isinstance(config.method, str):  # a ConfigDict takes None for any type
-        return list(_problems(config, FIELDS, known_tasks))
-    try:
-        known = fields(config.method)
-    except UsageError as error:
-        return [*error.faults, *_problems(config, FIELDS, known_tasks)]  # pyright: ignore
-    faults = list(_problems(config, known, known_tasks))
-    method = methods.get(config.method)
+    faults, known, method = [], FIELDS, None
+    if isinstance(config.method, str):  # a ConfigDict takes None for any type
+        with collecting(faults):
+            known, method = fields(config.method), methods.get(config.method)
+    faults += _problems(config, known, known_tasks)
     first, total = config.seed_frames, config.total_frames
     is_right = not {"seed_frames", "total_frames"} & {each.subject for each in faults}
-    if method.plays and is_right and first >= total:
+    if method and method.plays and is_right and first >= total:
         rule = f"leaves no update in total_frames={total}"
         faults.append(Fault("seed_frames", rule, "use fewer", first))
-    if method.needs_pixels and config.observation == "state":
+    if method and method.needs_pixels and config.observation == "state":
         rule = f"has no image, which {method.label} judges"
         faults.append(Fault("observation", rule, "use 'pixels'", "state"))
     return faults

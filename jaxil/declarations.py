@@ -199,29 +199,30 @@ def _section_problems(sections: Any) -> Iterator[str]:
                     "become one keyword; rename one"
                 )
             owners[name] = section
-            if type(field.default) not in KINDS:
-                yield (
-                    f"has {section}.{name} with the default {field.default!r}; give "
-                    "True or False, a number, text or a tuple"
-                )
-                continue
-            if not isinstance(field.choices, tuple | list) or not all(
-                isinstance(choice, str) for choice in field.choices
-            ):
-                words = f"choices={field.choices!r}; give a tuple of names"
-                yield f"has {section}.{name} with {words}"
-                continue
-            has_range = (field.low, field.high, field.at_most) != (None, None, "")
-            if has_range and type(field.default) not in (int, float):
-                yield f"has {section}.{name} with a range, which only numbers have"
-                continue
-            for fault in field_problems(f"{section}.{name}", field, field.default):
-                yield f"has a default that its own rule forbids: {fault}"
+            yield from _own_problems(f"{section}.{name}", field)
+
+
+def _own_problems(name: str, field: Field) -> Iterator[str]:
+    kind, choices = type(field.default), field.choices
+    has_range = (field.low, field.high, field.at_most) != (None, None, "")
+    if kind not in KINDS:
+        way_out = "give True or False, a number, text or a tuple"
+        yield f"has {name} with the default {field.default!r}; {way_out}"
+    elif not _are_texts(choices):
+        yield f"has {name} with choices={choices!r}; give a tuple of names"
+    elif has_range and kind not in (int, float):
+        yield f"has {name} with a range, which only numbers have"
+    else:
+        for fault in field_problems(name, field, field.default):
+            yield f"has a default that its own rule forbids: {fault}"
+
+
+def _are_texts(values: Any) -> bool:
+    return isinstance(values, tuple | list) and all(isinstance(v, str) for v in values)
 
 
 def _metric_problems(names: Any) -> Iterator[str]:
-    ordered = isinstance(names, tuple | list)
-    if not ordered or not all(isinstance(name, str) for name in names):
+    if not _are_texts(names):
         yield f"has metrics={names!r}; give a tuple of names"
         return
     for name in dict.fromkeys(names):

@@ -57,6 +57,7 @@ class Bench:
         self.run = run = _Loop.make(config, folder, self._demonstrations)
         self._environment = assembly.training_environment(config)
         self._closing = contextlib.ExitStack()
+        self.close = self._closing.close  # environments, their processes and files
         self._closing.callback(run.close)
         self._closing.callback(self._environment.close)
         run.progress = ProgressLine(config.total_frames, stream=io.StringIO())
@@ -154,15 +155,8 @@ class Bench:
         )
         return agent.update_step.lower(*shapes)
 
-    def close(self) -> None:
-        """Ends worker processes, closes environments and files."""
-        self._closing.close()
-
     def _physics_step(self) -> Callable[[], Any] | None:
-        """Returns a function that steps an environment without rendering.
-
-        None if the task observes images alone.
-        """
+        """Returns a step without rendering; None if the task observes images alone."""
         config = self.config.copy_and_resolve_references()
         with config.unlocked():
             config.observation = "state"

@@ -77,10 +77,7 @@ class Agent:
     def plan(
         self, state: Any, params: Any, episode: Episode, experts: Any
     ) -> tuple[np.ndarray, int]:
-        """Returns a plan [T + 1, N + 1], of a rewarder that has one, and whose it is.
-
-        The second is the index of the demonstration.
-        """
+        """Returns the rewarder's plan [T + 1, N + 1], and its demonstration's index."""
         found, index = self.padded_plan(state, params, self._padded(episode), experts)
         return np.asarray(found)[: episode.num_steps + 1], int(index)
 

@@ -18,9 +18,7 @@ def plot(
     title: str,
     expert_return: float | None = None,
 ) -> None:
-    """Plots the evaluations of a run as a PNG, which is replaced atomically.
-
-    `expert_return`, the mean of the demonstrations, is a dashed line.
+    """Plots the evaluations of a run, and the expert's mean return, as a PNG.
 
     Raises:
       OSError: the table cannot be read or the picture cannot be written.

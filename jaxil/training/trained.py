@@ -155,8 +155,7 @@ def _policy(folder: pathlib.Path, config: Config) -> Policy:
         one = jax.ShapeDtypeStruct(
             (1, *policy.observation_shape), policy.observation_dtype
         )
-        act = make_mean_action(networks)
-        jax.eval_shape(act, policy.params.encoder, policy.params.actor, one)
+        jax.eval_shape(policy._act, policy.params.encoder, policy.params.actor, one)
     except (FlaxError, TypeError, ValueError) as error:
         raise _unfit(folder, str(error)) from error
     return policy

@@ -114,14 +114,12 @@ class Updates:
         self, state: TrainState, indices: list[int], length: int
     ) -> np.ndarray:
         """Returns new rewards, [E, length], of episodes that are at most that long."""
-        replay = self._replay
+        replay, copied = self._replay, self._device_copy
         slots = np.stack([pad_rows(replay.slots(i), length + 1) for i in indices])
         actions = np.stack([pad_rows(replay.actions(i), length) for i in indices])
         num_steps = np.array([len(replay.slots(i)) - 1 for i in indices], np.int32)
-        if self._device_copy is not None:
-            frames = self._device_copy.frames
-        else:
-            frames = self._replay.frames[slots.ravel()]
+        frames = copied.frames if copied else replay.frames[slots.ravel()]
+        if copied is None:
             slots = np.arange(slots.size).reshape(slots.shape)
         rewards = self._agent.refresh(
             state.rewarder,

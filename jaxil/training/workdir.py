@@ -46,9 +46,8 @@ def from_flag(value: str | None) -> pathlib.Path:
       UsageError: it is missing, empty, or not a name that a file can have.
     """
     if not value:
-        raise UsageError(
-            "--workdir is missing or empty: name a folder, such as --workdir=runs/1"
-        )
+        way_out = "name a folder, such as --workdir=runs/1"
+        raise UsageError(f"--workdir is missing or empty: {way_out}")
     try:
         value.encode()
     except UnicodeEncodeError as error:
@@ -126,9 +125,7 @@ def problems(workdir: pathlib.Path, config: Config) -> list[Fault]:
 
 @contextlib.contextmanager
 def opened(workdir: pathlib.Path) -> Iterator[None]:
-    """Creates the folder and locks it against other processes.
-
-    Removes unfinished files of killed processes.
+    """Creates and locks the folder; removes unfinished files of killed processes.
 
     Raises:
       UsageError: the folder is not writable or in use.
@@ -254,14 +251,11 @@ def _read_json(path: pathlib.Path) -> dict[str, Any]:
     return json.loads(read_regular(path, _MAX_CONFIG_BYTES))
 
 
-def _differences(there: Config, here: Config) -> list[str]:
-    before, now = flat(as_stored(there.to_dict())), flat(as_stored(here.to_dict()))
-    return [
-        f"{field}: {_shown(before, field)} there, {_shown(now, field)} here"
-        for field in sorted(before.keys() | now.keys())
-        if before.get(field) != now.get(field) and field not in jaxil_config.FREE_FIELDS
-    ]
-
-
-def _shown(settings: dict[str, Any], field: str) -> str:
-    return printable(repr(settings.get(field)), 100)
+def _differences(old: Config, new: Config) -> list[str]:
+    before, now = flat(as_stored(old.to_dict())), flat(as_stored(new.to_dict()))
+    found = []
+    for field in sorted((before.keys() | now.keys()) - {*jaxil_config.FREE_FIELDS}):
+        if before.get(field) != now.get(field):
+            then, here = (printable(repr(s.get(field)), 100) for s in (before, now))
+            found.append(f"{field}: {then} there, {here} here")
+    return found
