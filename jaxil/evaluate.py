@@ -84,7 +84,8 @@ def _evaluate(
         videos = folder / "videos"
         try:
             videos.mkdir(exist_ok=True)
-            for kind, suffix in (("video", "mp4"), ("gif", "gif"))[: 1 + values.gif]:
+            kinds = {"video": "mp4", "gif": "gif"} if values.gif else {"video": "mp4"}
+            for kind, suffix in kinds.items():
                 path = videos / f"evaluation_{policy.frame:09d}.{suffix}"
                 film.write(path, sides)
                 print(f"{kind}: {path}")

@@ -72,7 +72,7 @@ def sides(
       image_size: height and width of the images.
       imitation_rewards: of the recorded episode, [T]; None if unknown.
       shows_progress: whether rendering shows a progress line.
-      stop_asked: asked between images; all take up to half a minute in software.
+      stop_asked: asked between images; rendering takes up to half a minute in software.
 
     Raises:
       Stopped: `stop_asked` said so.
