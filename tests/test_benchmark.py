@@ -13,6 +13,7 @@ from jaxil import config as jaxil_config
 from jaxil.errors import UsageError
 from jaxil.timing import measurement, start, summary
 from jaxil.timing.bench import Bench
+from jaxil.training import assembly
 from tests.commands import STATES, call, small
 
 _CONFIG = "--config=configs/tiny.py:pdac,ball_in_cup_catch"
@@ -145,6 +146,26 @@ def test_a_full_replay_is_full(tmp_path):
         frames, seconds, working = bench.loop(6, waits=True)
         assert frames == 60
         assert 0 < working <= seconds
+
+
+def test_what_fails_after_it_has_begun_is_closed(tmp_path, monkeypatch):
+    config = jaxil_config.default_config("drqv2", "cartpole_swingup")
+    config.update(observation="state", hidden_dim=16, batch_size=4, action_repeat=10)
+    made, closed = [], []
+    make = assembly.training_environment
+
+    def make_counted(config):
+        environment = make(config)
+        made.append(environment)
+        close = environment.close
+        monkeypatch.setattr(environment, "close", lambda: closed.append(close()))
+        return environment
+
+    monkeypatch.setattr(assembly, "training_environment", make_counted)
+    monkeypatch.setattr(Bench, "add_episode", lambda bench: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        Bench(config, tmp_path)
+    assert len(closed) == len(made) > 0
 
 
 def test_a_rewarder_observes_an_episode_before_it_learns(tmp_path):

@@ -212,7 +212,7 @@ def test_workers_are_of_this_machine_alone(name):
 
 def test_jobs_that_slurm_refuses_are_one_sentence(tmp_path, monkeypatch):
     refusal = "echo 'no partition nope' >&2; exit 1"
-    for name, text in (("sbatch", refusal), ("sinfo", "")):
+    for name, text in (("sbatch", refusal), ("srun", ""), ("sinfo", "")):
         (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
@@ -227,12 +227,17 @@ def test_jobs_that_slurm_refuses_are_one_sentence(tmp_path, monkeypatch):
 
 
 def test_slurm_commands_without_a_cluster_are_no_slurm(tmp_path, monkeypatch):
-    for name, text in (("sbatch", ""), ("sinfo", "echo 'no controller' >&2; exit 1")):
+    said = "sinfo fails (no controller)"
+    monkeypatch.setenv("PATH", str(tmp_path))
+    for name, text, expected in (
+        ("sinfo", "echo 'no controller' >&2; exit 1", "there is no command sbatch"),
+        ("sbatch", "", "there is no command srun"),
+        ("srun", "", said),
+    ):
         (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
         (tmp_path / name).chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    (fault,) = clusters.problems(Cluster("slurm"), starts=True)
-    assert "no Slurm here: sinfo fails (no controller)" in str(fault)
+        (fault,) = clusters.problems(Cluster("slurm"), starts=True)
+        assert f"no Slurm here: {expected}" in str(fault)
 
 
 def test_wrong_use_of_the_command_ends_with_status_2(tmp_path):

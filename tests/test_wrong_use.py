@@ -282,6 +282,13 @@ def test_all_folders_without_a_run_are_said(tmp_path):
         assert f"workdir='{name}' holds no run" in finished.stderr
 
 
+def test_a_logger_that_cannot_be_loaded_is_named_once():
+    config = jaxil_config.default_config("zero", "walker_walk")
+    config.logger = "nope:Logger"
+    (fault,) = assembly.problems(config)
+    assert str(fault).startswith("logger='nope:Logger' cannot be loaded")
+
+
 def test_a_wrong_policy_and_a_wrong_task_come_in_one_message(tmp_path):
     for task, said in (("walker_wlak", "walker_walk"), ("nope:make", "'nope:make'")):
         flags = (f"--task={task}", "--policy=nope:x", f"--output={tmp_path}/out.npz")

@@ -264,8 +264,9 @@ def _gpus() -> list[str]:
 
 def _slurm_fault() -> str | None:
     """Returns why no job can be queued from here; None if one can."""
-    if shutil.which("sbatch") is None:
-        return "there is no command sbatch"
+    for command in ("sbatch", "srun"):
+        if shutil.which(command) is None:
+            return f"there is no command {command}"
     try:
         _output("sinfo", "--noheader")
     except subprocess.CalledProcessError as error:

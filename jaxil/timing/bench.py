@@ -53,13 +53,21 @@ class Bench:
         with config.unlocked():
             config.exploration_steps = 0
             config.seed_frames = config.total_frames = config.action_repeat
+        # A run may dispatch several updates at once.
+        self._num_updates = config.updates_per_dispatch
         self._demonstrations = assembly.load_demonstrations(config)
-        self.run = run = _Loop.make(config, folder, self._demonstrations)
-        self._environment = assembly.training_environment(config)
-        self._closing = contextlib.ExitStack()
+        with contextlib.ExitStack() as opened:
+            self.run = _Loop.make(config, folder, self._demonstrations)
+            opened.callback(self.run.close)
+            self._environment = assembly.training_environment(config)
+            opened.callback(self._environment.close)
+            self._begin()
+            self._closing = opened.pop_all()
         self.close = self._closing.close  # environments, their processes and files
-        self._closing.callback(run.close)
-        self._closing.callback(self._environment.close)
+
+    def _begin(self) -> None:
+        """Stores and rewards an episode, updates once and starts the workers."""
+        run, config = self.run, self.config
         run.progress = ProgressLine(config.total_frames, stream=io.StringIO())
         self._rng = np.random.default_rng(0)
         self.episode = self._random_episode()
@@ -67,8 +75,6 @@ class Bench:
         run.reward(self.episode)  # a rewarder may have to observe one before it learns
         self.add_episode()
         self.batches = self.sample()  # of one update, on the host
-        # A run may dispatch several updates at once.
-        self._num_updates = config.updates_per_dispatch
         dispatched: Any = self.batches
         if self._num_updates > 1:
             copies = [self.batches] * self._num_updates
