@@ -63,8 +63,8 @@ class Run(Parts):
           TrainingDiverged: a loss, a reward or an action is not finite any more.
         """
         config, counters, player = self.config, self.counters, self.player
-        learning = self.stopwatch.timed("update")
-        act, learn = learning(self.act), learning(self.learn)
+        timed = self.stopwatch.timed("update")
+        act, learn = timed(self.act), timed(self.learn)
         if counters.owes_evaluation:
             self.evaluate()
             self.save()
@@ -94,7 +94,7 @@ class Run(Parts):
                 if self.is_due(counters.last_checkpoint_step, every):
                     self.save()
             self.progress.update(self.frame, self.stopwatch.seconds, self.returns)
-        learning(self.flush)()
+        timed(self.flush)()
 
     def wants_episode(self) -> bool:
         """Returns whether the budget has room for an episode beside the open ones."""

@@ -6,6 +6,27 @@ import jax.numpy as jnp
 from jax import Array
 
 
+def inference_error(inferred: Array, action: Array) -> Array:
+    """Returns the mean squared error of inferred actions on the agent's own samples.
+
+        E = mean |g(o_t, o_{t+1}) - a_t|^2
+
+    The squares are summed over the action's numbers; the mean is over samples and
+    models.
+
+    Args:
+      inferred: of one model [B, A], or of M models [M, B, A].
+      action: what the agent did. Shape [B, A].
+
+    Source: Torabi et al. 2018, arXiv:1805.01954, sec. 4.1: maximum likelihood, for
+    Gaussian actions of fixed variance.
+    """
+    chex.assert_rank([inferred, action], [{2, 3}, 2])
+    chex.assert_equal_shape_suffix([inferred, action], 2)
+    action = jnp.broadcast_to(action, inferred.shape)
+    return jnp.mean(jnp.sum(jnp.square(inferred - action), axis=-1))
+
+
 def disagreement(actions: Array) -> Array:
     """Returns the variance of the models' actions for each transition, [B].
 

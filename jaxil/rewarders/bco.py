@@ -22,7 +22,7 @@ from jaxil.learner.state import (
     init_module,
 )
 from jaxil.learner.update import Learner, UpdateStep
-from jaxil.maths import augmentation
+from jaxil.maths import augmentation, cloning
 from jaxil.maths.types import Batch, ExpertBatch, Metrics, Params
 from jaxil.networks.agent import AgentNetworks, apply
 from jaxil.networks.inverse_model import InverseModel
@@ -120,9 +120,7 @@ def make_update_step(
         )
 
         def loss(params: Params) -> Array:
-            inferred = apply(model, params, *pair)
-            chex.assert_equal_shape([inferred, batch.action])
-            return jnp.mean(jnp.sum(jnp.square(inferred - batch.action), axis=1))
+            return cloning.inference_error(apply(model, params, *pair), batch.action)
 
         error, gradients = jax.value_and_grad(loss)(state.rewarder.params)
         inverse = apply_gradients(state.rewarder, gradients, optimiser)

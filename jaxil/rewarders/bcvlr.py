@@ -25,7 +25,7 @@ from jaxil.learner.state import (
     init_module,
 )
 from jaxil.learner.update import Learner, UpdateStep
-from jaxil.maths import augmentation, losses, quantisation
+from jaxil.maths import augmentation, cloning, losses, quantisation
 from jaxil.maths.types import Batch, ExpertBatch, Metrics, Params
 from jaxil.networks.agent import AgentNetworks, apply
 from jaxil.networks.discriminator import Embedding
@@ -232,8 +232,7 @@ def make_update_step(
         """Returns the decoder's squared error on the agent's transitions."""
         _, latent = infer(params, pair)
         decoded = apply(model, params[1], latent, method=model.decode)
-        chex.assert_equal_shape([decoded, action])
-        return jnp.mean(jnp.sum(jnp.square(decoded - action), axis=1))
+        return cloning.inference_error(decoded, action)
 
     def bcvlr_step(
         state: TrainState, batch: Batch | None, expert: ExpertBatch | None

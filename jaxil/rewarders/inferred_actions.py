@@ -165,9 +165,7 @@ def with_cloning(
         )
 
         def loss(params: Params) -> Array:
-            inferred = apply(models, params, *pair)
-            chex.assert_equal_shape([inferred[0], view.action])
-            return jnp.mean(jnp.sum(jnp.square(inferred - view.action[None]), axis=2))
+            return cloning.inference_error(apply(models, params, *pair), view.action)
 
         error, gradients = jax.value_and_grad(loss)(state.models.params)
         agreement = cloning.agreement_trust(

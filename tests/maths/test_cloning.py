@@ -8,6 +8,14 @@ import pytest
 from jaxil.maths import cloning
 
 
+def test_an_inference_error_sums_over_the_action_and_averages_over_the_rest():
+    action = jnp.array([[0.0, 0.5], [1.0, -1.0]])
+    right, wrong = action, action + jnp.array([[0.5, 0.0], [0.0, 1.0]])
+    assert cloning.inference_error(wrong, action) == (0.25 + 1.0) / 2
+    both = jnp.stack([right, wrong])
+    assert cloning.inference_error(both, action) == (0.25 + 1.0) / 4
+
+
 def test_disagreement_is_the_models_variance_summed_over_dimensions():
     # Two models, three transitions, two dimensions.
     actions = jnp.array(
@@ -61,6 +69,8 @@ def test_the_scale_is_the_mean_size_of_the_smaller_value():
 @pytest.mark.parametrize(
     "call",
     [
+        lambda: cloning.inference_error(jnp.zeros((3, 1)), jnp.zeros((3, 2))),
+        lambda: cloning.inference_error(jnp.zeros((3, 4, 2)), jnp.zeros((1, 2))),
         lambda: cloning.disagreement(jnp.zeros((3, 2))),
         lambda: cloning.agreement_trust(jnp.zeros((3, 1)), scale=0.1),
         lambda: cloning.q_filter(jnp.zeros((2, 3)), jnp.zeros((2, 4))),
