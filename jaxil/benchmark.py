@@ -111,22 +111,30 @@ def _unwritable(path: str) -> str:
 
 
 def _define(values: flags.FlagValues) -> None:
-    text = functools.partial(flags.DEFINE_string, default=None, flag_values=values)
-    yes = functools.partial(flags.DEFINE_boolean, flag_values=values)
-    number = functools.partial(
+    define_text = functools.partial(
+        flags.DEFINE_string, default=None, flag_values=values
+    )
+    define_switch = functools.partial(flags.DEFINE_boolean, flag_values=values)
+    define_number = functools.partial(
         flags.DEFINE_integer, upper_bound=10**6, flag_values=values
     )
     command.define_config(values)
-    text("json", help="file for the results")
-    text("compare", help="file of an earlier --json: prints old, new and their ratio")
+    define_text("json", help="file for the results")
+    define_text(
+        "compare", help="file of an earlier --json: prints old, new and their ratio"
+    )
     field = "a config field to vary, such as batch_size:64,128"
-    text("sweep", help=f"FIELD:VALUE,VALUE,...: {field}; --json then writes a list")
-    yes("start", True, "also time compiling without a cache and starting a run")
-    yes("full", False, "fill the replay before memory is measured")
+    define_text(
+        "sweep", help=f"FIELD:VALUE,VALUE,...: {field}; --json then writes a list"
+    )
+    define_switch(
+        "start", True, "also time compiling without a cache and starting a run"
+    )
+    define_switch("full", False, "fill the replay before memory is measured")
     repeats = "timings of each part; ten times as many of the short ones"
-    number("repeats", 10, repeats, lower_bound=1)
+    define_number("repeats", 10, repeats, lower_bound=1)
     steps = "agent steps to time of the loop, with and without overlap"
-    number("steps", 40, steps, lower_bound=2)
+    define_number("steps", 40, steps, lower_bound=2)
 
 
 if __name__ == "__main__":

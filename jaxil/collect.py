@@ -220,32 +220,40 @@ def _named_output(argv: list[str]) -> list[str]:
 
 
 def _define(values: flags.FlagValues) -> None:
-    text = functools.partial(flags.DEFINE_string, default=None, flag_values=values)
-    number = functools.partial(flags.DEFINE_integer, flag_values=values)
+    define_text = functools.partial(
+        flags.DEFINE_string, default=None, flag_values=values
+    )
+    define_number = functools.partial(flags.DEFINE_integer, flag_values=values)
     flags.DEFINE_list(
         "workdirs",
         [],
         "comma-separated folders of runs of one task, of which the best is recorded",
         flag_values=values,
     )
-    text("policy", help="package.module:function, observation -> action, to record")
-    text("task", help="for --policy: the task, as in configs")
-    number("action_repeat", 2, "for --policy: frames of one step", 1, 100)
+    define_text(
+        "policy", help="package.module:function, observation -> action, to record"
+    )
+    define_text("task", help="for --policy: the task, as in configs")
+    define_number("action_repeat", 2, "for --policy: frames of one step", 1, 100)
     command.define_trust(values)
-    text("inspect", help="file or folder of any format, or task, to show")
-    text("convert", help="file or folder to convert to pixels; also --convert IN OUT")
-    text("output", help="NAME.npz; for --inspect a folder for contact sheet and video")
-    number("num_episodes", 50, "for --workdirs, --policy: episodes", 1, 10_000)
+    define_text("inspect", help="file or folder of any format, or task, to show")
+    define_text(
+        "convert", help="file or folder to convert to pixels; also --convert IN OUT"
+    )
+    define_text(
+        "output", help="NAME.npz; for --inspect a folder for contact sheet and video"
+    )
+    define_number("num_episodes", 50, "for --workdirs, --policy: episodes", 1, 10_000)
     image_size = "of images; without it videos shrink to 84 or 160, pixels keep theirs"
-    number("image_size", None, image_size, 8, 1024)
-    choices = functools.partial(flags.DEFINE_enum, flag_values=values)
+    define_number("image_size", None, image_size, 8, 1024)
+    define_choice = functools.partial(flags.DEFINE_enum, flag_values=values)
     quality, fit = FIELDS["render_quality"], FIELDS["demonstrations.fit"]
     how = "how --convert and --inspect render states"
-    choices("render_quality", quality.default, quality.choices, how)
+    define_choice("render_quality", quality.default, quality.choices, how)
     how = "how --convert --image_size makes frames square"
-    choices("fit", fit.default, fit.choices, how)
-    text("camera", help="which camera of a LeRobot dataset to read")
-    number("frame_skip", 1, "keeps every N-th frame of pixels", 1, 10_000)
+    define_choice("fit", fit.default, fit.choices, how)
+    define_text("camera", help="which camera of a LeRobot dataset to read")
+    define_number("frame_skip", 1, "keeps every N-th frame of pixels", 1, 10_000)
 
 
 if __name__ == "__main__":

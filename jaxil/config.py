@@ -249,11 +249,6 @@ def problems(config: Config, known_tasks: tuple[str, ...]) -> list[Fault]:
         with collecting(faults):
             known, method = fields(config.method), methods.get(config.method)
     faults += _problems(config, known, known_tasks)
-    first, total = config.seed_frames, config.total_frames
-    is_right = not {"seed_frames", "total_frames"} & {each.subject for each in faults}
-    if method and method.plays and is_right and first >= total:
-        rule = f"leaves no update in total_frames={total}"
-        faults.append(Fault("seed_frames", rule, "use fewer", first))
     if method and method.needs_pixels and config.observation == "state":
         rule = f"has no image, which {method.label} judges"
         faults.append(Fault("observation", rule, "use 'pixels'", "state"))

@@ -210,6 +210,8 @@ def _own_problems(name: str, field: Field) -> Iterator[str]:
         yield f"has {name} with the default {field.default!r}; {way_out}"
     elif not _are_texts(choices):
         yield f"has {name} with choices={choices!r}; give a tuple of names"
+    elif not isinstance(field.at_most, str):
+        yield f"has {name} with at_most={field.at_most!r}; give a field's name"
     elif has_range and kind not in (int, float):
         yield f"has {name} with a range, which only numbers have"
     else:

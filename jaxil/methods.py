@@ -34,8 +34,7 @@ DISCRIMINATOR = {
     "gradient_penalty": Field(10.0, "its weight; 10 in the paper", 0, 1e6),
     "batch_size": Field(
         128,
-        "expert samples, and as many encoded samples of the agent's batch, in an "
-        "update; 128 in ROT",
+        "expert samples, and samples of the agent's batch, in an update; 128 in ROT",
         1,
         65_536,
         at_most="batch_size",

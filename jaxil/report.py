@@ -96,9 +96,13 @@ def _write(values: flags.FlagValues) -> None:
 def _named_runs(argv: list[str]) -> list[str]:
     """Turns the words that are not flags into --runs=WORD, for the parser."""
     values = flags.FlagValues()
-    _define(values)
-    words = command.joined(argv[1:], values)
-    return argv[:1] + [w if w.startswith("-") else f"--runs={w}" for w in words]
+    _define(values)  # all take a value
+    named, takes_value = argv[:1], False
+    for word in argv[1:]:
+        is_flag = word.startswith("-")
+        named.append(word if is_flag or takes_value else f"--runs={word}")
+        takes_value = is_flag and word.lstrip("-") in values
+    return named
 
 
 def _define(values: flags.FlagValues) -> None:
@@ -107,13 +111,13 @@ def _define(values: flags.FlagValues) -> None:
     about = "new folder; an older report there is replaced"
     flags.DEFINE_string("output", "report", about, flag_values=values)
     command.define_trust(values)
-    number = functools.partial(flags.DEFINE_integer, flag_values=values)
+    define_number = functools.partial(flags.DEFINE_integer, flag_values=values)
     about = "how many seeds each variant should have; missing ones are listed"
-    number("seeds", None, about, lower_bound=1, upper_bound=_MAX_SEEDS)
+    define_number("seeds", None, about, lower_bound=1, upper_bound=_MAX_SEEDS)
     about = "how many of the newest videos to show for each variant on each task"
-    number("videos", 1, about, lower_bound=0)
+    define_number("videos", 1, about, lower_bound=0)
     about = "seconds between rewrites of the report, which go on until Ctrl-C"
-    number("watch", None, about, lower_bound=1, upper_bound=86_400)
+    define_number("watch", None, about, lower_bound=1, upper_bound=86_400)
 
 
 if __name__ == "__main__":

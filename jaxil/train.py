@@ -63,8 +63,6 @@ class Run(Parts):
           TrainingDiverged: a loss, a reward or an action is not finite any more.
         """
         config, counters, player = self.config, self.counters, self.player
-        timed = self.stopwatch.timed("update")
-        act, learn = timed(self.act), timed(self.learn)
         if counters.owes_evaluation:
             self.evaluate()
             self.save()
@@ -77,13 +75,16 @@ class Run(Parts):
             if is_spent and not (self.is_playing and whole_episodes):
                 break
             if player is None:
-                learn(config.update_every_steps)
+                with self.stopwatch.timed("update"):
+                    self.learn(config.update_every_steps)
                 episodes = []
             else:
-                actions = act(player.observations)
+                with self.stopwatch.timed("update"):
+                    actions = self.act(player.observations)
                 player.step(actions)
                 # The learner computes while the simulators step and render.
-                learn(len(actions))
+                with self.stopwatch.timed("update"):
+                    self.learn(len(actions))
                 episodes = player.observe()
             for episode in episodes:
                 self.store(episode)
@@ -94,7 +95,8 @@ class Run(Parts):
                 if self.is_due(counters.last_checkpoint_step, every):
                     self.save()
             self.progress.update(self.frame, self.stopwatch.seconds, self.returns)
-        timed(self.flush)()
+        with self.stopwatch.timed("update"):
+            self.flush()
 
     def wants_episode(self) -> bool:
         """Returns whether the budget has room for an episode beside the open ones."""

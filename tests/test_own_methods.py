@@ -84,6 +84,7 @@ def test_all_faults_of_a_declaration_are_one_message(write):
         "flat": {"weight": methods.Field(1.0, ""), "sizes": methods.Field([8], "")},
         "bare": {"rate": 0.1},
         "far": {"away": methods.Field(3, "", 0, 2), "name": methods.Field("", "", 0)},
+        "tied": {"rate": methods.Field(1.0, "", at_most=["batch_size"])},
     },
     sees_actions="flat.sight",
     metrics=("mean", "critic/own", "flat/mean", "flat/mean"),"""
@@ -97,6 +98,7 @@ def test_all_faults_of_a_declaration_are_one_message(write):
         "sections['bare']={'rate': 0.1}; give a dict of Field",
         "far.away=3 must lie in [0, 2]",
         "far.name with a range, which only numbers have",
+        "tied.rate with at_most=['batch_size']; give a field's name",
         "sees_actions='flat.sight', which is none of its fields",
         "metric 'mean'; write GROUP/NAME",
         "metric 'critic/own'",

@@ -176,7 +176,6 @@ def _fitted(
     image_size = None if options.keep_aspect else options.image_size
     for index, episode in enumerate(item for item in items if item is not None):
         frames, actions, rewards, stored_size = episode
-        stored_size = stored_size or frames.shape[1:3]
         num_steps = int((len(frames) - 1) / stride + 1e-6)
         if num_steps < 1:
             what = f"has {len(frames)} frames in episode {index}"
@@ -197,12 +196,13 @@ def _fitted(
             if rewards is not None:
                 sums = np.append(0.0, np.cumsum(rewards, dtype=np.float64))
                 rewards = np.diff(sums[times]).astype(np.float32)
+        height, width = stored_size or frames.shape[1:3]
         if image_size is not None and frames.shape[1:3] != (image_size, image_size):
             num_bytes = len(frames) * image_size**2 * 3
             options.check_bytes(f"frames at {image_size}x{image_size}", num_bytes)
             size = (image_size, image_size)
             frames = np.stack([resized(x, size, options.fit) for x in frames])
-        yield PixelEpisode(frames, actions, rewards, stored_size)
+        yield PixelEpisode(frames, actions, rewards, (height, width))
 
 
 def _stacked(name: str, values: list[np.ndarray | None]) -> np.ndarray | None:

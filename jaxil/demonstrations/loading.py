@@ -62,12 +62,14 @@ def load(
 ) -> Demonstrations:
     """Loads demonstrations; states are rendered by the agent's own environment.
 
-    Arguments not listed are those of `rendering.observe_episodes`.
+    Arguments not listed are those of `tasks.make_environment`.
 
     Args:
       source: a file or folder of any format in `foreign.FORMATS`; "" for the task's
         shipped states.
+      cache: whether to cache rendered images.
       warns: whether to warn of what differs from the agent's observations.
+      progress: called with (images done, all images) while rendering.
       wanted: the fields of `Wanted`; `task` is required.
 
     Raises:

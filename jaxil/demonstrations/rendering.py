@@ -39,7 +39,10 @@ def observe_episodes(
     states: Mapping[str, np.ndarray],
     *,
     task: str,
+    seed: int,
     first_episode: int,
+    image_size: int,
+    render_quality: str,
     cache: bool = True,
     progress: Callable[[int, int], None] | None = None,
     processes: int | None = None,
@@ -47,16 +50,17 @@ def observe_episodes(
 ) -> np.ndarray:
     """Observes stored episodes with the agent's own environment.
 
+    Arguments and errors not listed are those of `tasks.make_environment`.
+
     Args:
       states: `qpos`, `qvel` and `act`, each of shape [K, N + 1, n].
-      task: see `tasks.make_environment`, as for errors not listed.
-      first_episode: its number in the recording environment, whose seed is among the
-        settings. The two restore what is not in the states: targets, terrain.
+      seed: of the recording environment.
+      first_episode: its number there. The two restore what is not in the states:
+        targets, terrain.
       cache: whether to read and write images in `cache_folder()`.
       progress: called with (images done, all images) while rendering.
       processes: None chooses the number. The images do not depend on it.
-      settings: `seed`, `image_size`, `render_quality` and, if they are not those of
-        `make_environment`, `observation`, `camera` and `distraction`.
+      settings: `observation`, `camera` and `distraction`, if they are not the usual.
 
     Returns:
       Images, uint8 [K, N + 1, H, W, 3], or states, float32 [K, N + 1, S].
@@ -65,7 +69,13 @@ def observe_episodes(
       ValueError: the task has no simulator states, or these do not fit its model.
       RuntimeError: rendering is not available.
     """
-    settings |= {"task": task, "frame_stack": 1}
+    settings |= {
+        "task": task,
+        "seed": seed,
+        "image_size": image_size,
+        "frame_stack": 1,
+        "render_quality": render_quality,
+    }
     is_rendered = settings.get("observation", "pixels") == "pixels"
     with tasks.make_environment(**settings) as environment:
         if not isinstance(environment, suite.SuiteEnvironment):

@@ -15,7 +15,8 @@ class Wanted(NamedTuple):
       num_episodes: the file's first ones.
       action_repeat: the agent's; a multiple of the one in a file of states. Rewards of
         merged steps are summed, and the first action is kept.
-      max_episode_frames: of the agent's episodes; 0: the task's own limit.
+      max_episode_frames: of the agent's episodes; 0: the task's own limit. A file whose
+        episodes have another length is warned of.
       image_size: height and width of the frames.
       observation: "pixels" or "state".
       frame_skip: keeps every n-th frame of a file of pixels.
@@ -23,7 +24,8 @@ class Wanted(NamedTuple):
       fit: "stretch", "crop" or "pad": how frames of other shapes become squares.
       dataset_camera: of a dataset with several.
       stated_action_repeat: of a file of pixels that does not say it; 0 if unknown.
-      takes_fewer: whether fewer episodes will do.
+      takes_fewer: whether fewer episodes will do; `loading` sets it where it is not
+        given `num_episodes`.
       max_bytes: of all arrays together.
     """
 

@@ -136,7 +136,7 @@ class _Worker:
             self._pipe.send(request)
 
     def receive(self, seconds: float) -> Moment | str:
-        """Returns the result, or why there is none; `has_raised` marks an error."""
+        """Returns the result, or why there is none: a traceback if `has_raised`."""
         try:
             if not self._pipe.poll(seconds):
                 return f"did not answer for {seconds:g} s"

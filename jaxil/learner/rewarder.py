@@ -155,7 +155,13 @@ class Rewarder(NamedTuple):
     relabel: Callable[[RewarderState, LearnerParams, Batch], Array] | None = None
     rewards_changed: Callable[[RewarderState], Array | bool] | None = None
     actor_loss: OfSamples[Array] | None = None
-    plan: OfEpisode[tuple[Array, Array]] | None = None
+    plan: (
+        Callable[
+            [RewarderState, LearnerParams, AnyEpisode, ExpertEpisodes],
+            tuple[Array, Array],
+        ]
+        | None
+    ) = None
     summary: Callable[[RewarderState], Metrics] = lambda state: {}
 
 

@@ -70,6 +70,13 @@ class Figure(NamedTuple):
     has_short_budget: bool  # as the paper's ablations: ABLATION_FRAMES
 
 
+class Study(NamedTuple):
+    """What one name of `jaxil sweep --ablation` trains."""
+
+    variants: tuple[Variant, ...]
+    has_short_budget: bool  # as the paper's ablations: ABLATION_FRAMES
+
+
 def _product(names: str, *changes: Mapping[str, Any]) -> tuple[Variant, ...]:
     return tuple(
         Variant(name, change) for name in names.split() for change in changes or [{}]
@@ -104,11 +111,11 @@ FIGURES = {
 }
 
 
-def studies() -> dict[str, Figure]:
+def studies() -> dict[str, Study]:
     """Returns what `jaxil sweep --ablation` offers, by name.
 
-    Those are the paper's figures, and `video_alone`, which is none: every method that
-    plays and needs no actions, from 1, 10 and 50 demonstrations.
+    Those are the paper's figures, and `video_alone`: every method that plays and needs
+    no actions, from 1, 10 and 50 demonstrations.
     """
     alone = [
         name
@@ -117,9 +124,11 @@ def studies() -> dict[str, Figure]:
         and method.uses_demonstrations
         and method.sees_actions is not True
     ]
-    variants = _product(" ".join(alone), *_NUMBERS)
-    paper = {f"figure{number}": figure for number, figure in FIGURES.items()}
-    return {**paper, "video_alone": Figure(0, "video alone", "frames", variants, True)}
+    paper = {
+        f"figure{number}": Study(figure.variants, figure.has_short_budget)
+        for number, figure in FIGURES.items()
+    }
+    return {**paper, "video_alone": Study(_product(" ".join(alone), *_NUMBERS), True)}
 
 
 def declaration(name: str) -> Method:

@@ -43,6 +43,8 @@ _TITLES = {
     "frames_per_second": "frames/s",
     "iqm": "IQM",
     _EARLY: f"IQM to {EARLY_FRAMES:,} frames",
+    **{f"{estimate}_low": "90 % from" for estimate in ("mean", "iqm", _EARLY)},
+    **{f"{estimate}_high": "to" for estimate in ("mean", "iqm", _EARLY)},
     **{f"reached_{percent}": f"reached {percent} %" for percent in _PERCENTS},
     **{f"frames_{percent}": f"{percent} % after frames" for percent in _PERCENTS},
     **{f"hours_{percent}": f"{percent} % after hours" for percent in _PERCENTS},
@@ -75,10 +77,6 @@ def to_csv(table: Table) -> bytes:
 
 def title(column: str) -> str:
     """Returns a column's name on the page."""
-    if column.endswith("_low"):
-        return "90 % from"
-    if column.endswith("_high"):
-        return "to"
     return _TITLES.get(column, column.replace("_", " "))
 
 

@@ -4,8 +4,6 @@ The agent never acts in the environment; each update counts as the frames that o
 methods play per update.
 """
 
-from typing import Any
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -34,9 +32,9 @@ METHOD = methods.Method(
 )
 
 
-def make_rewarder(agent: AgentSpec, *, batch_size: int, **_: Any) -> Rewarder:
+def make_rewarder(agent: AgentSpec, *, batch_size: int, std: float) -> Rewarder:
     """Returns a rewarder of zeros, which asks for expert samples."""
-    del agent
+    del agent, std
     return Rewarder(zero_rewards, expert_batch_size=batch_size)
 
 

@@ -51,14 +51,15 @@ def make_rewarder(
     agent: AgentSpec,
     *,
     batch_size: int,
+    std: float,
     hidden_dim: int,
     learning_rate: float,
-    **_: Any,
 ) -> Rewarder:
     """Returns a rewarder of zeros, whose state is the inverse model.
 
     For the arguments see `make_update_step`.
     """
+    del std
     model = _inverse_model(agent.networks, hidden_dim)
 
     def init(key: Array, spec: Spec, *_: Any) -> ModuleState:

@@ -60,6 +60,10 @@ def add_cloning(make_inner: Callable[..., Rewarder]) -> Callable[..., Rewarder]:
     own = {*methods.PSEUDO_ACTIONS, *methods.INVERSE_MODELS}
 
     def make_rewarder(agent: AgentSpec, **fields: Any) -> Rewarder:
+        """Returns the inner method's rewarder with `with_cloning`.
+
+        `fields` are the inner method's, and those of `with_cloning`.
+        """
         cloning = {name: fields.pop(name) for name in own & fields.keys()}
         return with_cloning(make_inner(agent, **fields), agent, **cloning)
 
@@ -227,13 +231,15 @@ def with_cloning(
             return None
         return lambda state, *arguments: function(state.inner, *arguments)
 
-    return rewarder._replace(
-        rewards=of_inner(rewarder.rewards),
-        init=init,
-        update=update,
-        observe=observe,
+    return Rewarder(
+        of_inner(rewarder.rewards),
+        init,
+        update,
+        observe,
         expert_batch_size=expert_batch_size,
+        matches_episodes=rewarder.matches_episodes,
         samples_successors=True,
+        ignores_padding=rewarder.ignores_padding,
         relabel=of_inner(rewarder.relabel),
         rewards_changed=of_inner(rewarder.rewards_changed),
         actor_loss=actor_loss,

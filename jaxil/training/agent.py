@@ -39,8 +39,9 @@ _MAX_UPDATES = 2**31 - 1  # an int32 counts them
 class Agent:
     """The compiled functions of a run, and its first state.
 
-    Those of an episode take a whole one, without padding, after the rewarder's state
-    and the learner, and before the expert episodes.
+    The methods `observe`, `rewards` and `plan` take a whole episode without padding,
+    after the rewarder's state and the learner, and before the expert episodes; the
+    fields `padded_*` take it padded. There is a plan only if the rewarder has one.
     """
 
     rewarder: Rewarder

@@ -33,8 +33,14 @@ from jaxil.training.stopwatch import Stopwatch, TimedEnvironments
 EVALUATION_SEED = 1_000_003
 # Those that `tasks.make_environment` takes.
 _ENVIRONMENT_FIELDS = (
-    *("action_repeat", "image_size", "frame_stack", "render_quality", "observation"),
-    *("camera", "distraction", "max_episode_frames"),
+    "action_repeat",
+    "image_size",
+    "frame_stack",
+    "render_quality",
+    "observation",
+    "camera",
+    "distraction",
+    "max_episode_frames",
 )
 # With a fault in one of these, the demonstrations are not opened.
 _READING_FIELDS = {
@@ -56,6 +62,11 @@ def problems(config: Config) -> list[Fault]:
     if isinstance(config.logger, str):
         faults += loggers.problems(config.logger)
     bad = {fault.subject.partition(".")[0] for fault in faults}
+    if not bad & {"method", "seed_frames", "total_frames"}:
+        first, total = config.seed_frames, config.total_frames
+        if methods.get(config.method).plays and first >= total:
+            rule = f"leaves no update in total_frames={total}"
+            faults.append(Fault("seed_frames", rule, "use fewer", first))
     if not bad & {"task", "method", *_ENVIRONMENT_FIELDS}:
         checks_length = not bad & {"replay_size_steps", "num_steps"}
         found = task_problems(config, checks_length=checks_length)
@@ -221,11 +232,17 @@ def _file_settings(config: Config) -> dict[str, Any]:
     """Returns the source and the fields of `loading.Wanted`."""
     settings = config.demonstrations
     usual = jaxil_config.FIELDS["demonstrations.num_episodes"].default
-    of_agent = ("task", "action_repeat", "max_episode_frames", "image_size")
-    of_file = ("source", "num_episodes", "sampling", "fit", "frame_skip")
     return {
-        **{name: config[name] for name in (*of_agent, "observation")},
-        **{name: settings[name] for name in of_file},
+        "task": config.task,
+        "action_repeat": config.action_repeat,
+        "max_episode_frames": config.max_episode_frames,
+        "image_size": config.image_size,
+        "observation": config.observation,
+        "source": settings.source,
+        "num_episodes": settings.num_episodes,
+        "sampling": settings.sampling,
+        "fit": settings.fit,
+        "frame_skip": settings.frame_skip,
         "takes_fewer": bool(settings.source) and settings.num_episodes == usual,
         "stated_action_repeat": settings.action_repeat,
         "dataset_camera": settings.camera,

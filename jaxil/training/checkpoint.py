@@ -159,6 +159,9 @@ class Checkpoints:
         Returns:
           The parameters of encoder, actor and critic by these names; the mean image
           that the encoder subtracts, None where there is none; and the counters.
+
+        Raises:
+          CheckpointError: there is no checkpoint, or none can be read.
         """
         path, record, tree = self._read(
             lambda _, arrays: unflatten_dict(arrays, sep=".")

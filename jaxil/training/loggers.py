@@ -7,7 +7,7 @@ import os
 import pathlib
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
 from jaxil import outside
@@ -45,7 +45,7 @@ class Logger(Protocol):
         ...
 
 
-def problems(name: str) -> Sequence[Fault | str]:
+def problems(name: str) -> list[Fault]:
     """Returns why a run cannot have the logger of its config."""
     if not name:
         return []
@@ -58,7 +58,7 @@ def problems(name: str) -> Sequence[Fault | str]:
             rule = "must be wandb or package.module:function"
             return [Fault("logger", rule, value=name)]
     except UsageError as error:
-        return error.faults
+        return [fault for fault in error.faults if isinstance(fault, Fault)]
     except importlib.metadata.PackageNotFoundError:
         rule = "needs Weights & Biases, which is not installed"
         way_out = "pip install wandb, or in jaxil's folder: pip install '.[wandb]'"

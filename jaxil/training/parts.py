@@ -36,8 +36,8 @@ class Counters:
     num_evals: int = 0
     last_eval_step: int = 0  # agent step, like the next two
     last_checkpoint_step: int = 0
-    last_refresh_step: int = 0  # of stored rewards
-    rewards_are_stale: bool = False  # whether stored rewards have changed since
+    last_refresh_step: int = 0  # when stored rewards were last recomputed
+    rewards_are_stale: bool = False  # whether they would differ if recomputed now
     owes_evaluation: bool = False  # whether one was due when the run was stopped
     # Of the last update; for the next row of train.csv.
     metrics: dict[str, Any] = dataclasses.field(default_factory=dict)

@@ -112,19 +112,22 @@ class RunLog:
         self._speed = 0.0
 
     def episode(self, when: When, values: Mapping[str, Any]) -> None:
-        """Logs a training episode; `values` are the columns from `task_return` on."""
-        frames, seconds = when.frame - self._last.frame, when.seconds
-        if frames > 0:  # else it ended in the same round as the one before
-            self._speed = frames / max(seconds - self._last.seconds, 1e-9)
-            self._last = when
-        self.updates(when, {"frames_per_second": round(self._speed, 2), **values})
-
-    def updates(self, when: When, values: Mapping[str, Any]) -> None:
-        """Logs a row of train.csv; of a method that plays no episodes, metrics alone.
+        """Logs a training episode; `values` are the columns from `task_return` on.
 
         Raises:
           MethodError: the method does not declare all of its metrics.
         """
+        frames, seconds = when.frame - self._last.frame, when.seconds
+        if frames > 0:  # else it ended in the same round as the one before
+            self._speed = frames / max(seconds - self._last.seconds, 1e-9)
+            self._last = when
+        self._training(when, {"frames_per_second": round(self._speed, 2), **values})
+
+    def updates(self, when: When, values: Mapping[str, Any]) -> None:
+        """Logs the metrics of a method that plays no episodes; see `episode`."""
+        self._training(when, values)
+
+    def _training(self, when: When, values: Mapping[str, Any]) -> None:
         unknown = sorted(set(values) - {*TRAIN_COLUMNS, *self._metrics})
         if unknown:
             raise MethodError(

@@ -16,7 +16,7 @@ class Stopwatch:
 
     @contextlib.contextmanager
     def timed(self, activity: str) -> Iterator[None]:
-        """Adds the time of a block, or of a function that it decorates."""
+        """Adds the time of a block, or of each call of a function that it decorates."""
         start = time.perf_counter()
         try:
             yield

@@ -101,8 +101,11 @@ class Policy:
 def load_policy(folder: str | os.PathLike) -> Policy:
     """Returns the policy of a run's newest whole checkpoint.
 
-    The run, whose `--workdir` is `folder`, may go on meanwhile. Neither demonstrations
-    nor the simulator are needed.
+    The run may still be running. Neither its demonstrations nor the simulator are
+    needed.
+
+    Args:
+      folder: `--workdir` of the run.
 
     Raises:
       UsageError: there is no run, no checkpoint, or none can be read.

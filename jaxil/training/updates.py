@@ -39,7 +39,8 @@ class Updates:
     ) -> None:
         """Takes the demonstrations and, for methods that match episodes, `experts`.
 
-        The replay must be filled already when a run is resumed.
+        With `replay_on_device` this copies the frames to the device, so the replay must
+        be filled already when a run is resumed.
         """
         self._config, self._agent, self._replay = config, agent, replay
         self._demonstrations, self._experts = demonstrations, experts
@@ -118,9 +119,11 @@ class Updates:
         slots = np.stack([pad_rows(replay.slots(i), length + 1) for i in indices])
         actions = np.stack([pad_rows(replay.actions(i), length) for i in indices])
         num_steps = np.array([len(replay.slots(i)) - 1 for i in indices], np.int32)
-        frames = copied.frames if copied else replay.frames[slots.ravel()]
         if copied is None:
+            frames = replay.frames[slots.ravel()]
             slots = np.arange(slots.size).reshape(slots.shape)
+        else:
+            frames = copied.frames
         rewards = self._agent.refresh(
             state.rewarder,
             state.params,
@@ -139,8 +142,8 @@ class Updates:
         """
         if not self._config.replay_on_device:
             return None
-        agent = None if self._device_copy is None else self._device_copy.frames
-        return Frames(agent, self._expert_frames)
+        copied = self._device_copy
+        return Frames(None if copied is None else copied.frames, self._expert_frames)
 
     def sample(self, rng: np.random.Generator) -> Sampled:
         """Samples what one update learns from."""

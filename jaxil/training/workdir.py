@@ -190,10 +190,14 @@ def read_config(workdir: pathlib.Path, *, imports_task: bool = True) -> Config:
     Fields that are newer than the run have their defaults, which are how older versions
     behaved. Fields that no longer exist are left out.
 
+    Args:
+      workdir: the folder.
+      imports_task: whether the task's code will be imported, so that the user must
+        have named it unless it is jaxil's.
+
     Raises:
       UsageError: there is no config, it cannot be read, or it names code that the user
-        has not (see `outside.require_trusted`): a method, or a task, whose code matters
-        only if `imports_task`.
+        has not (see `outside.require_trusted`).
     """
     path = workdir / "config.json"
     try:
@@ -251,11 +255,15 @@ def _read_json(path: pathlib.Path) -> dict[str, Any]:
     return json.loads(read_regular(path, _MAX_CONFIG_BYTES))
 
 
-def _differences(old: Config, new: Config) -> list[str]:
-    before, now = flat(as_stored(old.to_dict())), flat(as_stored(new.to_dict()))
-    found = []
-    for field in sorted((before.keys() | now.keys()) - {*jaxil_config.FREE_FIELDS}):
-        if before.get(field) != now.get(field):
-            then, here = (printable(repr(s.get(field)), 100) for s in (before, now))
-            found.append(f"{field}: {then} there, {here} here")
-    return found
+def _differences(there: Config, here: Config) -> list[str]:
+    before, now = flat(as_stored(there.to_dict())), flat(as_stored(here.to_dict()))
+    fields = (before.keys() | now.keys()) - {*jaxil_config.FREE_FIELDS}
+    return [
+        f"{field}: {_shown(before, field)} there, {_shown(now, field)} here"
+        for field in sorted(fields)
+        if before.get(field) != now.get(field)
+    ]
+
+
+def _shown(settings: dict[str, Any], field: str) -> str:
+    return printable(repr(settings.get(field)), 100)
