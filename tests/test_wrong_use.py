@@ -69,18 +69,6 @@ def test_a_bad_value_is_named_with_rule_and_way_out(field, value, expected):
         assert word in str(faults[0])
 
 
-def test_a_run_without_an_update_is_refused_but_an_old_one_can_be_read():
-    config = jaxil_config.default_config("zero", "walker_walk")
-    config.seed_frames = config.total_frames = 4_000
-    (fault,) = assembly.problems(config)
-    words = "seed_frames=4000 leaves no update in total_frames=4000; use fewer"
-    assert str(fault) == words
-    assert jaxil_config.problems(config, _TASKS) == []
-    bc = jaxil_config.default_config("bc", "walker_walk")  # which waits for nothing
-    bc.total_frames = 2_000
-    assert assembly.problems(bc) == []
-
-
 def test_an_encoder_has_a_layer():
     config = jaxil_config.default_config("pdac", "walker_walk")
     for name in ("channels", "kernel_sizes", "strides"):

@@ -62,11 +62,6 @@ def problems(config: Config) -> list[Fault]:
     if isinstance(config.logger, str):
         faults += loggers.problems(config.logger)
     bad = {fault.subject.partition(".")[0] for fault in faults}
-    if not bad & {"method", "seed_frames", "total_frames"}:
-        first, total = config.seed_frames, config.total_frames
-        if methods.get(config.method).plays and first >= total:
-            rule = f"leaves no update in total_frames={total}"
-            faults.append(Fault("seed_frames", rule, "use fewer", first))
     if not bad & {"task", "method", *_ENVIRONMENT_FIELDS}:
         checks_length = not bad & {"replay_size_steps", "num_steps"}
         found = task_problems(config, checks_length=checks_length)
