@@ -99,6 +99,7 @@ class Spec(NamedTuple):
     observation_shape: tuple[int, ...]
 
 
+# Types of a rewarder's functions, by what they read.
 Result = TypeVar("Result")
 OfEpisode = Callable[
     [RewarderState, LearnerParams, AnyEpisode, ExpertEpisodes | None], Result

@@ -104,12 +104,12 @@ def logit_sheet(groups: Sequence[Group]) -> Sheet | None:
     for task, task_groups in tasks_of(groups).items():
         pairs = []
         for group in task_groups:
-            both = (
+            expert, agent = (
                 measures.curves([group], "frame", column, table="training")
                 for column in _LOGITS
             )
-            for pair in zip(*both):  # one, of expert and agent, or none
-                pairs.append(pair)
+            if expert and agent:
+                pairs.append((expert[0], agent[0]))
                 # Dashes mean something else here: the legend shows colours only.
                 shown.append(group._replace(look=group.look._replace(dashes=())))
         if pairs:
